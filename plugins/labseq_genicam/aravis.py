@@ -148,7 +148,7 @@ class AravisConnection(Connection):
                 camera.set_packet_size(self.packet_size)
             if delay_s is not None:
                 camera.set_packet_delay_s(delay_s)
-        return {}
+            return {"packet_size_now": camera.packet_size if camera.is_ethernet else None}
 
     def close(self) -> None:
         """Release the camera; repeatable. If it is gone this takes the library 10 s, so a thread does it."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
-from labseq.plugin import CameraFacts, Context, DeviceError
+from labseq.plugin import CameraFacts, Context, DeviceError, Trigger
 from labseq.plugin.camera import CameraDriver, ExposureResult, Series
 from labseq_genicam.connection import Connection
 from labseq_genicam.features import Features
@@ -41,6 +41,7 @@ class StandardCamera(CameraDriver):
         self.features: Features | None = None
         self.reported: dict[str, Any] = {}
         self._exposure_s = math.nan
+        self._set_for: tuple[Trigger, int] | None = None
 
     @property
     def facts(self) -> CameraFacts:
@@ -65,7 +66,7 @@ class StandardCamera(CameraDriver):
         return described
 
     def _connect(self) -> None:
-        connection, settings = self.connection, self._settings
+        connection, settings, self._set_for = self.connection, self._settings, None
         self.features = features = Features(self._name, connection.open(), connection.doing)
         connection.check_identity(model=settings.model)
         firmware = features.read(str, "DeviceFirmwareVersion", "DeviceVersion") or ""
@@ -82,7 +83,7 @@ class StandardCamera(CameraDriver):
         trigger = connection.trigger_of(series)
         if not connection.goes_on(trigger):
             connection.stop()
-            set_trigger(features, settings, trigger, series.n_frames)
+            self._set_trigger(features, trigger, series.n_frames)
         # with bulb the pulse is the exposure
         self._exposure_s = (
             series.exposure_s if trigger == "bulb" else set_exposure(features, series.exposure_s)
@@ -92,6 +93,14 @@ class StandardCamera(CameraDriver):
             period_s = frame_period_s(features, settings, series, trigger)
         connection.arm(series, period_s)
         connection.start(series, trigger)
+
+    def _set_trigger(self, features: Features, trigger: Trigger, n_frames: int) -> None:
+        """Choose what starts the exposures, unless that is set already: it takes tens of commands."""
+        wanted = trigger, n_frames if trigger == "external_start" else 0
+        if wanted != self._set_for:
+            self._set_for = None
+            set_trigger(features, self._settings, trigger, n_frames)
+            self._set_for = wanted
 
     def _fire(self) -> None:
         self._opened()

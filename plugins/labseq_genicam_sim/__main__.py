@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import json
 import os
 import queue
 import signal
@@ -20,18 +19,7 @@ from labseq_aravis.camera import Camera
 from labseq_aravis.library import AravisError, load_library
 
 from labseq_genicam_sim.description import MODEL, REGISTERS, TEXTS, VENDOR, description
-from labseq_genicam_sim.messages import (
-    EXPOSE,
-    IMAGE,
-    NO_IMAGE,
-    READY,
-    REFUSED,
-    Channel,
-    Exposure,
-    Faults,
-    Setup,
-    to_json,
-)
+from labseq_genicam_sim.messages import Channel, Exposure, Image, NotStarted, Ready, Setup
 from labseq_genicam_sim.network import FIRST_ADDRESS, has_port, move, own_addresses
 
 TRIGGER_POLLS_HZ: Final = 250.0
@@ -164,34 +152,30 @@ class Process:
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
-        self._images: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._images: queue.SimpleQueue[Image] = queue.SimpleQueue()
 
     def run(self) -> None:
         """Run the camera until the parent is gone."""
-        message = self._channel.receive()
-        if message is None:
+        setup = self._channel.receive()
+        if setup is None:
             return
-        values = json.loads(message[1])
-        setup = Setup(**values | {"faults": Faults(**values["faults"])})
         try:
             self._camera = SimulatedCamera(setup, self._expose)
             if setup.faults.busy:  # control of the camera, as another application would have it
                 self._other = Camera(self._camera.address)
         except AravisError as error:
-            self._channel.send(REFUSED, str(error).encode())
+            self._channel.send(NotStarted(str(error)))
             return
-        self._channel.send(READY, self._camera.address.encode())
-        while (message := self._channel.receive()) is not None:
-            kind, data = message
-            if kind in (IMAGE, NO_IMAGE):
-                self._images.put(data if kind == IMAGE else None)
+        self._channel.send(Ready(self._camera.address))
+        while (image := self._channel.receive()) is not None:
+            self._images.put(image)
 
     def _expose(self, exposure: Exposure) -> bytes | None:
         try:
-            self._channel.send(EXPOSE, to_json(exposure))
+            self._channel.send(exposure)
         except OSError:
             os._exit(0)
-        return self._images.get()
+        return self._images.get().pixels
 
 
 def main() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import tempfile
@@ -16,19 +15,7 @@ from labseq_aravis.library import AravisError, load_library
 from labseq_aravis.stream import MONO
 from numpy.typing import NDArray
 
-from labseq_genicam_sim.messages import (
-    EXPOSE,
-    IMAGE,
-    NO_IMAGE,
-    READY,
-    REFUSED,
-    SETUP,
-    Channel,
-    Exposure,
-    Faults,
-    Setup,
-    to_json,
-)
+from labseq_genicam_sim.messages import Channel, Exposure, Faults, Image, NotStarted, Ready, Setup
 
 START_TIMEOUT_S: Final = 30.0
 """How long a camera may take to start; it takes half a second on an idle machine."""
@@ -97,7 +84,7 @@ class FakeCamera:
         self._service.start()
         setup = Setup(self._serial, self._sensor_shape, self.address, self._faults)
         try:
-            self._send(SETUP, to_json(setup))
+            self._send(setup)
             if not self._wait(lambda: self._is_ready or self._has_ended, START_TIMEOUT_S):
                 text = f"the simulated camera did not start within {START_TIMEOUT_S:g} s"
                 raise AravisError(text, "timeout")
@@ -168,15 +155,14 @@ class FakeCamera:
 
     def _serve(self, channel: Channel) -> None:
         """Answer the camera until it is gone."""
-        while (message := _receive(channel)) is not None:
-            kind, data = message
-            if kind == EXPOSE:
-                self._answer(channel, Exposure(**json.loads(data)))
+        while (message := channel.receive()) is not None:
+            if isinstance(message, Exposure):
+                self._answer(channel, message)
             with self._changed:
-                if kind == READY:
-                    self.address, self._is_ready = data.decode(), True
-                elif kind == REFUSED:
-                    self._errors.append(AravisError(data.decode(), "refused"))
+                if isinstance(message, Ready):
+                    self.address, self._is_ready = message.address, True
+                elif isinstance(message, NotStarted):
+                    self._errors.append(AravisError(message.reason, "refused"))
                 self._changed.notify_all()
         with self._changed:
             self._has_ended = self._has_ended or channel is self._channel
@@ -192,15 +178,15 @@ class FakeCamera:
             self._n_made += 1
             self._changed.notify_all()
         try:
-            channel.send(NO_IMAGE if image is None else IMAGE, b"" if image is None else image)
+            channel.send(Image(None if image is None else image.tobytes()))
         except (OSError, ValueError):
             return  # the camera is gone
 
-    def _send(self, kind: bytes, data: bytes) -> None:
+    def _send(self, message: object) -> None:
         try:
             if not self.is_running:
                 raise OSError
-            self._channel.send(kind, data)
+            self._channel.send(message)
         except (OSError, ValueError) as error:
             raise AravisError(self._reason(), "not connected") from error
 
@@ -232,10 +218,3 @@ def _pixels(image: NDArray[np.uint16], exposure: Exposure) -> NDArray[np.uint16]
     if largest is not None:
         image = np.minimum(image, np.uint16(largest))
     return np.ascontiguousarray(image, np.uint8 if exposure.pixel_format == MONO["Mono8"] else "<u2")
-
-
-def _receive(channel: Channel) -> tuple[bytes, bytes] | None:
-    try:
-        return channel.receive()
-    except (OSError, ValueError):  # closed meanwhile
-        return None

@@ -1,25 +1,12 @@
-"""Messages between a simulated camera's process and its parent, through two pipes."""
+"""Messages between a simulated camera's process and its parent, pickled, through two pipes."""
 
 from __future__ import annotations
 
-import json
-import struct
+import pickle
 import threading
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import IO, Any, Final
-
-HEAD: Final = struct.Struct("<4sQ")
-"""Kind of a message, and size of its data in bytes."""
-
-# from the parent
-SETUP: Final = b"SET1"  # JSON of a Setup
-IMAGE: Final = b"IMAG"  # the bytes of a frame, in the camera's pixel format
-NO_IMAGE: Final = b"NONE"  # there is no image; the frame fails
-# from the camera
-READY: Final = b"HELO"  # its address
-REFUSED: Final = b"ERRO"  # why it cannot start
-EXPOSE: Final = b"EXPO"  # JSON of an Exposure
 
 GAIN_STEP: Final = 1e-3
 """Gain per step of its register."""
@@ -63,9 +50,37 @@ class Setup:
     faults: Faults
 
 
-def to_json(message: Setup | Exposure) -> bytes:
-    """JSON of a message; its values are the arguments of its class."""
-    return json.dumps(asdict(message)).encode()
+@dataclass(frozen=True, slots=True)
+class Image:
+    """What the parent answers to an exposure.
+
+    Attributes:
+        pixels: The bytes of a frame, in the camera's pixel format; None: the frame fails.
+    """
+
+    pixels: bytes | None
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """The camera can be reached.
+
+    Attributes:
+        address: Its IP address.
+    """
+
+    address: str
+
+
+@dataclass(frozen=True, slots=True)
+class NotStarted:
+    """The camera cannot start.
+
+    Attributes:
+        reason: Why.
+    """
+
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,19 +124,15 @@ class Channel:
         self._writer = writer
         self._sending = threading.Lock()
 
-    def send(self, kind: bytes, data: Any = b"") -> None:
-        """Send a message; ``data`` is any object with contiguous bytes."""
-        view = memoryview(data).cast("B")
+    def send(self, message: object) -> None:
+        """Send a message."""
         with self._sending:
-            self._writer.write(HEAD.pack(kind, len(view)))
-            self._writer.write(view)
+            pickle.dump(message, self._writer)
             self._writer.flush()
 
-    def receive(self) -> tuple[bytes, bytes] | None:
+    def receive(self) -> Any:
         """Wait for a message; None when the other side is gone."""
-        head = self._reader.read(HEAD.size)
-        if len(head) < HEAD.size:
+        try:
+            return pickle.load(self._reader)  # noqa: S301 - the other side is a process of ours
+        except (OSError, EOFError, ValueError, pickle.UnpicklingError):  # closed, or cut off
             return None
-        kind, size = HEAD.unpack(head)
-        data = self._reader.read(size)
-        return (kind, data) if len(data) == size else None
