@@ -100,7 +100,7 @@ class AndorConnection:
         with self._translated_errors() as sdk, sdk.lock:
             handle = sdk.GetCameraHandle(index)
             sdk.SetCurrentCamera(handle)
-            sdk.Initialize(None if sys.platform == "win32" else LINUX_FOLDER)
+            sdk.Initialize(b"" if sys.platform == "win32" else LINUX_FOLDER)
             sdk.n_open += 1
             self._handle = handle
             self.serial = sdk.GetCameraSerialNumber()

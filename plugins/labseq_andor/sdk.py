@@ -160,6 +160,8 @@ class AndorSdk:
         self.n_open = 0
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name not in SIGNATURES:
+            raise AttributeError(name)
         inputs, outputs = SIGNATURES[name].split(" ")
         function = getattr(self._library, name, None)
         if function is None:

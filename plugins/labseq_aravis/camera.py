@@ -18,8 +18,8 @@ CHECK_RANGES: Final = 1
 NO_PACKET_SOCKET: Final = 1
 """Numbers of the library's policies for ranges and for streams."""
 
-KINDS: Final[dict[type, str]] = {str: "string", bool: "boolean", int: "integer", float: "float"}
-"""The library's names of kinds of features."""
+KINDS: Final[dict[type, str]] = {bool: "boolean", int: "integer", float: "float", str: "string"}
+"""The library's names of kinds of features; bool first, since each is an int, too."""
 
 Value = TypeVar("Value", str, bool, int, float)
 Number = TypeVar("Number", int, float)
@@ -197,8 +197,9 @@ class Camera:
 
     def set(self, feature: str, value: str | float) -> None:
         """Set a feature of the kind that the value has: bool, int, float or str."""
+        kind = next(name for kind, name in KINDS.items() if isinstance(value, kind))
         encoded = value.encode() if isinstance(value, str) else value
-        self._call(f"arv_camera_set_{KINDS[type(value)]}", feature.encode(), encoded)
+        self._call(f"arv_camera_set_{kind}", feature.encode(), encoded)
 
     def bounds(self, feature: str, kind: type[Number]) -> tuple[Number, Number]:
         """Smallest and largest value of a number."""

@@ -121,7 +121,7 @@ class Features:
         """Set an integer; ``value`` and its limits in errors are in units of ``unit``, the binning."""
         check_step(f"{self.name}: {what}", value, self.integer_bounds(feature), unit)
         with self._doing(f"set its {what}"):
-            self._nodes.set(feature, value // unit)
+            self._nodes.set(feature, int(value) // unit)
 
     def set_float(
         self, what: str, feature: str, value: float, say: Callable[[float], str] = "{:g}".format

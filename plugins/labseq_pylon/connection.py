@@ -216,13 +216,13 @@ def find_camera(sdk: Sdk, serial: str | None) -> Any:
         factory = sdk.pylon.TlFactory.GetInstance()
         infos = list(factory.EnumerateDevices())
     if serial is not None:
-        found = [info for info in infos if info.GetSerialNumber() == serial]
+        matches = [info for info in infos if info.GetSerialNumber() == serial]
     else:
-        found = [info for info in infos if info.GetDeviceClass() != EMULATION]
-    if len(found) != 1:
-        raise DeviceError(sdk.name, _why_not_one(serial, len(found), _listed(found or infos)))
+        matches = [info for info in infos if info.GetDeviceClass() != EMULATION]
+    if len(matches) != 1:
+        raise DeviceError(sdk.name, _why_not_one(serial, len(matches), _listed(matches or infos)))
     with sdk.doing("reach the camera", IN_USE):
-        return factory.CreateDevice(found[0])
+        return factory.CreateDevice(matches[0])
 
 
 def _why_not_one(serial: str | None, n_found: int, listed: str) -> str:
