@@ -152,6 +152,7 @@ def set_trigger(features: Features, settings: StandardSettings, trigger: Trigger
     features.choose_if_offered("AcquisitionMode", "Continuous")
     for feature in ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled"):
         features.switch(feature, is_on=trigger in TIMED_BY_CAMERA)
+    features.choose_if_offered("TriggerMode", "Off")  # a camera with one trigger has no selector
     for selector in features.options("TriggerSelector"):  # they act together unless they are off
         features.choose_if_offered("TriggerSelector", selector)
         features.choose_if_offered("TriggerMode", "Off")
