@@ -41,7 +41,7 @@ class StandardCamera(CameraDriver):
         self.features: Features | None = None
         self.reported: dict[str, Any] = {}
         self._exposure_s = math.nan
-        self._set_for: tuple[Trigger, int] | None = None
+        self._set_for: Trigger | None = None
 
     @property
     def facts(self) -> CameraFacts:
@@ -95,12 +95,14 @@ class StandardCamera(CameraDriver):
         connection.start(series, trigger)
 
     def _set_trigger(self, features: Features, trigger: Trigger, n_frames: int) -> None:
-        """Choose what starts the exposures, unless that is set already: it takes tens of commands."""
-        wanted = trigger, n_frames if trigger == "external_start" else 0
-        if wanted != self._set_for:
+        """Choose what starts the exposures, unless that is set already: it takes tens of commands.
+
+        Where the camera times them it is set again, since the last frame rate would limit the exposure time.
+        """
+        if trigger != self._set_for:
             self._set_for = None
             set_trigger(features, self._settings, trigger, n_frames)
-            self._set_for = wanted
+            self._set_for = None if trigger in TIMED_BY_CAMERA else trigger
 
     def _fire(self) -> None:
         self._opened()

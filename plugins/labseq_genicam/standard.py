@@ -48,6 +48,7 @@ def set_up(
     for auto in ("ExposureAuto", "GainAuto", "AcquisitionFrameRateAuto"):
         features.choose_if_offered(auto, "Off")
     features.choose_if_offered("ExposureMode", "Timed")
+    _limit_frame_rate(features, is_on=False)
     _check_line_trigger(features, settings)
     reported = _set_image_format(features, settings, sensor_shape)
     if settings.gain is not None:
@@ -150,8 +151,7 @@ def _check_line_trigger(features: Features, settings: StandardSettings) -> None:
 def set_trigger(features: Features, settings: StandardSettings, trigger: Trigger, n_frames: int) -> None:
     """Choose what starts the exposures of a series."""
     features.choose_if_offered("AcquisitionMode", "Continuous")
-    for feature in ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled"):
-        features.switch(feature, is_on=trigger in TIMED_BY_CAMERA)
+    _limit_frame_rate(features, is_on=False)
     features.choose_if_offered("TriggerMode", "Off")  # a camera with one trigger has no selector
     for selector in features.options("TriggerSelector"):  # they act together unless they are off
         features.choose_if_offered("TriggerSelector", selector)
@@ -165,6 +165,12 @@ def set_trigger(features: Features, settings: StandardSettings, trigger: Trigger
     elif trigger != "internal":
         source = "Software" if trigger == "software" else settings.trigger_line
         _choose_trigger(features, settings, "FrameStart", source)
+
+
+def _limit_frame_rate(features: Features, *, is_on: bool) -> None:
+    """Switch the frame rate on or off; while it is on, it limits the exposure time."""
+    for feature in ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled"):
+        features.switch(feature, is_on=is_on)
 
 
 def _shorten_overlap(features: Features) -> None:
@@ -212,6 +218,7 @@ def frame_period_s(features: Features, settings: StandardSettings, series: Serie
     if series.trigger == "external_start":
         setting, wanted_hz = "line_trigger: external_start", 1.0 / (settings.cycle_time or 1.0)
     natural_s = series.exposure_s + settings.readout
+    _limit_frame_rate(features, is_on=trigger in TIMED_BY_CAMERA)
     if not (feature := features.find(*FRAME_RATE)):
         if wanted_hz is None:
             return natural_s

@@ -13,14 +13,15 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from labseq_genicam.aravis import LAST_ID, FrameCounter
 from labseq_genicam.features import Features
-from labseq_genicam.settings import BITS
-from labseq_genicam.standard import temperature_k
+from labseq_genicam.settings import BITS, StandardSettings
+from labseq_genicam.standard import frame_period_s, set_exposure, set_trigger, temperature_k
 from labseq_genicam_sim.messages import Exposure
 from numpy.typing import NDArray
 
 from labseq import Frame
 from labseq.errors import DeviceTimeoutError
 from labseq.plugin import SensorMode
+from labseq.plugin.camera import Series
 from labseq.roles import NeverStopped, Trigger
 
 from .labseq_camera_rig import assert_shown, opened_rig, sensors
@@ -176,6 +177,48 @@ def test_the_temperature_of_a_camera_that_measures_one_is_in_kelvins() -> None:
     assert temperature_k(features) == pytest.approx(294.65)
     values.clear()
     assert temperature_k(features) is None
+
+
+class LimitedNodes:
+    """A camera with one trigger, whose frame rate limits its exposure time while it is switched on."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, Any] = {"AcquisitionFrameRateEnable": True, "AcquisitionFrameRate": 100.0}
+        self.values |= {"ExposureTime": 1e3, "TriggerMode": "On", "TriggerSource": "Line1"}
+
+    def is_available(self, feature: str) -> bool:
+        return feature in self.values
+
+    def options(self, feature: str) -> tuple[str, ...]:
+        return {"TriggerMode": ("Off", "On"), "TriggerSource": ("Software", "Line1")}.get(feature, ())
+
+    def get(self, feature: str, kind: type[Any]) -> Any:
+        return kind(self.values[feature])
+
+    def set(self, feature: str, value: str | float) -> None:
+        self.values[feature] = value
+
+    def bounds(self, feature: str, kind: type[Any]) -> tuple[Any, Any]:
+        if feature == "ExposureTime" and self.values["AcquisitionFrameRateEnable"]:
+            return kind(10), kind(1e6 / self.values["AcquisitionFrameRate"])
+        return kind(0), kind(1e7)
+
+    def increment(self, feature: str) -> int:
+        return 1
+
+
+def test_a_frame_rate_that_was_set_before_does_not_limit_the_exposure() -> None:
+    nodes, standard = LimitedNodes(), StandardSettings(readout=0.0)
+    features = Features("camera", nodes, lambda _: nullcontext())
+    for exposure_s in (5e-3, 0.05, 0.02):
+        set_trigger(features, standard, "internal", 2)
+        assert nodes.values["TriggerMode"] == "Off"
+        assert set_exposure(features, exposure_s) == pytest.approx(exposure_s)
+        series = Series(2, exposure_s, "internal")
+        assert frame_period_s(features, standard, series, "internal") == pytest.approx(exposure_s)
+        assert nodes.values["AcquisitionFrameRateEnable"]
+    set_trigger(features, standard, "software", 2)
+    assert (nodes.values["TriggerSource"], nodes.values["AcquisitionFrameRateEnable"]) == ("Software", False)
 
 
 @needs_aravis
