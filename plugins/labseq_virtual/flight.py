@@ -24,6 +24,7 @@ from labseq_virtual.rf_analysis import (
     Tracks,
     bands,
     check_resolvable,
+    forget_transforms,
     reach_hz,
     track_tones,
 )
@@ -295,6 +296,7 @@ class RfTransport:
             tracks_of_axes.append(
                 track_tones(spans, start_s, end_s, self._bands[axis], transit_s, min_v, SLEW_HZ)
             )
+        forget_transforms()
         n_frames = min(len(tracks.t_s) for tracks in tracks_of_axes)
         sites: list[Floats] = []
         depths: list[Floats] = []

@@ -251,7 +251,8 @@ def track_tones(
     reach, apart = (max(2, round(hz / bin_hz)) for hz in (REACH_HZ, APART_HZ))
     parts = range(0, sound.n_frames, FRAMES)
     n_most = 64  # simultaneous tones of an axis
-    tones = [find_tones(_power(sound.spectra(k)), min_v**2, apart, reach, n_most) for k in parts]
+    powers = (power for k in parts for power in _powers(sound.spectra(k)))
+    tones = [find_tones(power, min_v**2, apart, reach, n_most) for power in powers]
     centroid, count = (np.concatenate(part) for part in zip(*tones, strict=True))
     tracks, n_tracks = link_tones(centroid, count, slew_hz / HOPS / bin_hz)
     tracks = np.ascontiguousarray(tracks[:, :n_tracks])
@@ -292,8 +293,22 @@ class _Spectra:
         return self._last[1]
 
 
-def _power(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
-    return spectra.real**2 + spectra.imag**2
+def _powers(spectra: NDArray[np.complex64]) -> Iterator[NDArray[np.float32]]:
+    """The squared magnitudes, some frames at a time: those of all would take as much memory again."""
+    for first in range(0, len(spectra), 256):
+        part = spectra[first : first + 256]
+        yield part.real**2 + part.imag**2
+
+
+def forget_transforms() -> None:
+    """Free the tables that SciPy keeps of the latest 16 lengths: 18 MB for each program, as none recurs.
+
+    It has no call for that, so 16 short transforms take their places.
+    """
+    from scipy import fft
+
+    for n in range(1, 17):
+        fft.rfft(np.zeros(n, np.float32))
 
 
 ROUNDING_S: Final = 1e-8
