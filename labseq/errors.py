@@ -140,7 +140,7 @@ class ProblemCollector:
 
 
 @contextmanager
-def collecting(problems: ProblemCollector | None) -> Generator[ProblemCollector]:
+def collecting(problems: ProblemCollector | None = None) -> Generator[ProblemCollector]:
     """Collect the problems of a block for the caller; without a collector, raise them all when it ends."""
     if problems is not None:
         yield problems

@@ -354,7 +354,7 @@ class _Replayer:
         if not options:
             return recorded
         assert recorded.document is not None
-        with collecting(None) as problems:
+        with collecting() as problems:
             document = recorded.document.override_all(options, problems, may_add=(kind,))
         return resolve(self._host, document, kind, document.validate(Choice, (kind,)).placed(kind))
 

@@ -12,7 +12,7 @@ from labseq.data.columns import QUANTITIES
 from labseq.data.quantities import OF_IMAGES, quantity_problem, split_name
 from labseq.errors import Loc, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing
-from labseq.model.policies import RunPolicy, StepPolicy
+from labseq.model.policies import NO_POLICY, RunPolicy, StepPolicy
 from labseq.model.records import unique_names
 from labseq.recording.results import PREFIX
 from labseq.roles import Step
@@ -89,7 +89,7 @@ def make_policy(
     """The policies of a run and its steps."""
     own = sequence.policy
     otherwise = StepPolicy(on_failure=own.on_failure, over_budget=own.over_budget)
-    policies = [StepPolicy()] * len(sequence.shot)
+    policies = [NO_POLICY] * len(sequence.shot)
     for number, spec in enumerate(sequence.shot):
         with problems:
             policies[number] = _step_policy(document, spec, otherwise)

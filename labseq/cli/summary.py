@@ -248,8 +248,11 @@ def histogram_text(counts: Sequence[int]) -> str:
 def _skipped_rows(skipped: Sequence[SkippedShots]) -> Facts:
     """A row for each reason why shots were skipped, with the shots."""
     rows = [
-        ("skipped", f"{'shot' if len(shots) == 1 else 'shots'} {_numbers(shots)}: {clean(why)}")
-        for shots, why in ((group.shots, group.why) for group in skipped[:MAX_LISTED])
+        (
+            "skipped",
+            f"{'shot' if len(group.shots) == 1 else 'shots'} {_numbers(group.shots)}: {clean(group.why)}",
+        )
+        for group in skipped[:MAX_LISTED]
     ]
     n_more = len(skipped) - MAX_LISTED
     return rows if n_more <= 0 else [*rows, ("", f"and for {plural(n_more, 'other reason')}")]

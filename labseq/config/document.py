@@ -178,7 +178,7 @@ class Document:
         """
         paths = [override.address.split(".") for override in overrides]
         parents = {".".join(path[:n]) for path in paths for n in range(1, len(path))}
-        with collecting(None) as problems:
+        with collecting() as problems:
             return cls.parse("{}", called).override_all(overrides, problems, may_add=parents)
 
     def override_all(

@@ -114,9 +114,10 @@ def error_location(error: BaseException, home: Path | None) -> str:
     plugin_frames = [
         f for f in frames if home is not None and home in (Path(f.filename), *Path(f.filename).parents)
     ]
-    # labseq's own lines say nothing of the plugin: they are all there is if its signature is wrong
+    # the lines that call a factory say nothing of the plugin: they are all there is if its signature is wrong
     package = Path(__file__).parents[1]
-    other_frames = [f for f in frames if package not in Path(f.filename).parents]
+    callers = {package / "assembly", package / "plugins", package / "guard.py"}
+    other_frames = [f for f in frames if not {Path(f.filename), Path(f.filename).parent} & callers]
     frame = (plugin_frames or other_frames or [None])[-1]
     return "" if frame is None else f"{frame.filename}:{frame.lineno}"
 
