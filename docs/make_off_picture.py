@@ -22,28 +22,35 @@ from typing import Final
 import matplotlib.pyplot as plt
 import numpy as np
 from labseq_soapy_sim import read_trace
-from labseq_spcm_sim.emergency import Connection
 from numpy.typing import NDArray
+
+from tests.plugins.card_process_emergency import Connection
 
 PICTURE: Final = Path(__file__).parent / "_static" / "off_after_kill.png"
 BEFORE_S: Final = 0.02
-AFTER_S: Final = 0.1
+AFTER_S: Final = 0.3
 STEP_S: Final = 0.5e-3
 
 LABSEQ: Final = """
-import sys
+import sys, threading
+import numpy as np
 from labseq.motion import tone_program
 from labseq.plugin import Context, MotionSpec, Plan, SiteGrid
+from labseq.plugin.motion import RfSpec
 from labseq.watchdog import Watchdog
 from labseq_soapy.settings import SoapySettings
 from labseq_soapy.static_tweezers import SoapyStaticTweezers
-from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm import card, replay_fifo
 from labseq_spcm.settings import SpcmSettings
+from tests.plugins.card_process import TweezersOfProcess
 
+card.TRANSFER_TIMEOUT_S = replay_fifo.TRANSFER_TIMEOUT_S = 60.0  # samples go through a pipe
 folder = sys.argv[1]
-motion = MotionSpec(max_row_tones=16, max_column_tones=5, speed_m_s=1e-5)
-card = SpcmSettings(card=f"simulated@{folder}/card", mode="dds")
-mobile = SpcmMobileTweezers(card, Context("mobile_tweezers", motion=motion))
+hz, band = np.linspace(12e6, 18e6, 5), (10e6, 20e6)
+grid = SiteGrid(5, 5, row_frequency_hz=hz, column_frequency_hz=hz)
+motion = MotionSpec(speed_m_s=1e-5, rf=RfSpec(row_band_hz=band, column_band_hz=band))
+settings = SpcmSettings(card=f"simulated@{folder}/card", mode="fifo", sample_rate=50e6, fill=0.5)
+mobile = TweezersOfProcess(settings, Context("mobile_tweezers", grid, motion=motion))
 comb = {"centre": 100e6, "step": 60e3}
 device = f"simulated,speed=1,buffer=0.02,patience=0,record=100000000,folder={folder}"
 radio = SoapySettings(device=device, sample_rate=1.2e6, row_frequency=comb, column_frequency=comb)
@@ -51,14 +58,15 @@ static = SoapyStaticTweezers(radio, Context("static_tweezers", SiteGrid(3, 4)))
 mobile.open()
 static.open()
 plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])] * 3)
-mobile.prepare(tone_program(plan, motion=motion))
+mobile.prepare(tone_program(plan, grid, motion))
 if sys.argv[2] == "watched":
     watchdog = Watchdog()
     for order, device in enumerate((mobile, static)):
         found = device.emergency()
         watchdog.add(str(order), order, found.script, dict(found.arguments))
-mobile.play()
 static.start()
+mobile.play()
+threading.Thread(target=mobile.wait, args=(1e3,), daemon=True).start()
 print(static.emergency().arguments["pid"], flush=True)
 sys.stdin.read()
 """
@@ -103,15 +111,13 @@ def record(folder: Path, *, is_watched: bool) -> Outputs:
 
 
 def _of_card(card: Connection, killed_s: float) -> Values:
-    power = np.zeros(len(TIMES_S))
+    square = np.zeros(len(TIMES_S))
     for span in card("played", 0):
-        now = (span.start_s <= killed_s + TIMES_S) & (killed_s + TIMES_S < span.end_s)
-        for index in np.flatnonzero(now):
-            later_s = killed_s + TIMES_S[index] - span.start_s
-            power[index] = sum(
-                (tone.after(later_s).amplitude * span.amplitude_v) ** 2 / 2 for tone in span.tones
-            )
-    return 1e3 * np.sqrt(power)
+        for index, start_s in enumerate(killed_s + TIMES_S):
+            if span.start_s < start_s + STEP_S and span.end_s > start_s:
+                values = span.between(start_s, start_s + STEP_S).values() * (span.amplitude_v / 32767)
+                square[index] += np.sum(values**2) / (STEP_S * span.sample_rate_hz)
+    return 1e3 * np.sqrt(square)
 
 
 def _of_radio(folder: Path, killed_s: float) -> tuple[Values, NDArray[np.bool_]]:
@@ -141,8 +147,8 @@ def draw(watched: Outputs, alone: Outputs, path: Path) -> None:
     dark = alone.transmits & (alone.radio == 0)
     top_of_band = 0.06 * bottom.get_ylim()[1]
     bottom.fill_between(times_ms, 0, top_of_band, where=dark, color="#b00020", alpha=0.35, linewidth=0)
-    bottom.annotate("transmitters still on", (60, 1.2 * top_of_band), color="#b00020")
-    top.set_title("Simulated AWG in the mode dds, output 0")
+    bottom.annotate("transmitters still on", (210, 1.2 * top_of_band), color="#b00020")
+    top.set_title("Simulated AWG in the mode fifo, output 0")
     top.set_ylabel("rms voltage (mV)")
     bottom.set_title("Simulated radio, output 0")
     bottom.set_ylabel("rms (full scale = 1)")

@@ -1,15 +1,14 @@
 """An open card: registers that are read back, transfers, and errors as labseq raises them.
 
-Of the package ``spcm`` only ``Card`` and its registers are used. Its classes for channels, clock,
-transfers and DDS do not check what the card really set; the README lists their faults.
+The lower part of the vendor's package ``spcm``, ``spcm_core``, has the functions and registers of the driver
+library, as the manual has them. The classes on top do not check what the card really set, and import
+matplotlib.
 """
 
 from __future__ import annotations
 
 import ctypes
 import mmap
-from collections.abc import Callable, Generator
-from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 import numpy as np
@@ -46,7 +45,7 @@ class AwgCard:
 
     Args:
         name: Name of the device in the profile, for messages.
-        library: Where ``spcm`` and the card come from.
+        library: Where ``spcm_core`` and the card come from.
         clock: The session's time.
 
     Attributes:
@@ -63,57 +62,49 @@ class AwgCard:
         self.clock = clock
         self.spcm = spcm = load_spcm(name, library)
         self.library = library
-        identifier = library.connect()
-        self._card: Any = spcm.Card(identifier)
-        try:
-            self._card.open()
-        except spcm.SpcmException as error:
-            reason = self._open_error() or str(error)
-            self._forget()
+        device_name = library.connect()
+        self._handle: Any = spcm.spcm_hOpen(ctypes.create_string_buffer(device_name.encode()))
+        if not self._handle:
+            reason = self.clear_error()
+            library.disconnect()
             hint = "see its name in Spectrum's Control Center, and close what else uses it"
-            raise DeviceError(name, f"cannot open the card '{identifier}': {reason}; {hint}") from error
-
-    def _open_error(self) -> str:
-        """Why the driver library did not open the card; ``spcm`` does not ask."""
-        text = ctypes.create_string_buffer(self.spcm.ERRORTEXTLEN)
-        self.spcm.spcm_dwGetErrorInfo_i32(None, None, None, ctypes.byref(text))
-        return text.value.decode(errors="replace")
-
-    def _forget(self) -> None:
-        """Keep ``spcm`` from closing the handle again when it collects the object, which would fail."""
-        vars(self._card)["_closed"] = True
-        self.library.disconnect()
+            raise DeviceError(name, f"cannot open the card '{device_name}': {reason}; {hint}")
 
     def close(self) -> None:
-        """Close the card; errors of a card that is gone are ignored."""
-        with suppress(self.spcm.SpcmException, self.spcm.SpcmTimeout):
-            self.clear_error()
-            self._card.close()
-        self._forget()
+        """Close the card; what it does goes on."""
+        self.spcm.spcm_vClose(self._handle)
+        self.library.disconnect()
 
-    @contextmanager
-    def _translated_errors(self, action: str) -> Generator[None]:
-        try:
-            yield
-        except self.spcm.SpcmTimeout as error:
-            raise DeviceTimeoutError(self.name, f"{action}: the card's driver timed out", 0.0) from error
-        except self.spcm.SpcmException as error:
-            raise DeviceError(self.name, f"{action}: {error}") from error
+    def clear_error(self) -> str:
+        """Read the pending error: until then the driver library refuses every other call."""
+        text = ctypes.create_string_buffer(self.spcm.ERRORTEXTLEN)
+        self.spcm.spcm_dwGetErrorInfo_i32(self._handle or None, None, None, ctypes.byref(text))
+        return " ".join(text.value.decode(errors="replace").split())
+
+    def _check(self, code: int, action: str) -> None:
+        """Raise the error that a function of the driver library has returned."""
+        if code == self.spcm.ERR_TIMEOUT:
+            raise DeviceTimeoutError(self.name, f"{action}: the card's driver timed out", 0.0)
+        if code:
+            raise DeviceError(self.name, f"{action}: {self.clear_error()}")
 
     @property
     def handle(self) -> int:
         """The handle of the driver library, as an address."""
-        return ctypes.cast(self._card.handle(), ctypes.c_void_p).value or 0
+        return ctypes.cast(self._handle, ctypes.c_void_p).value or 0
 
     @property
     def product(self) -> str:
         """Product name, such as "M4i.6631-x8"."""
-        return str(self._card.product_name())
+        spcm, text = self.spcm, ctypes.create_string_buffer(32)
+        code = spcm.spcm_dwGetParam_ptr(self._handle, spcm.SPC_PCITYP, text, ctypes.c_uint64(len(text)))
+        self._check(code, "reading the product name")
+        return text.value.decode(errors="replace")
 
     @property
     def serial_number(self) -> int:
         """Serial number."""
-        return int(self._card.sn())
+        return self.read(self.spcm.SPC_PCISERIALNO)
 
     @property
     def status(self) -> int:
@@ -130,19 +121,16 @@ class AwgCard:
         """Whether a trigger has come since the start."""
         return bool(self.status & self.spcm.M2STAT_CARD_TRIGGER)
 
-    def clear_error(self) -> str:
-        """Read the pending error: until then the driver library refuses every other call."""
-        return str(self._card.get_error_info())
-
     def read(self, register: int) -> int:
         """Read a register."""
-        with self._translated_errors(f"reading register {register}"):
-            return int(self._card.get_i(register))
+        value = ctypes.c_int64()
+        code = self.spcm.spcm_dwGetParam_i64(self._handle, register, ctypes.byref(value))
+        self._check(code, f"reading register {register}")
+        return value.value
 
     def write(self, register: int, value: int, name: str) -> None:
         """Write a register that cannot be read back."""
-        with self._translated_errors(f"{name} = {value}"):
-            self._card.set_i(register, value)
+        self._check(self.spcm.spcm_dwSetParam_i64(self._handle, register, value), f"{name} = {value}")
 
     def set(self, register: int, value: int, name: str, tolerance: int = 0) -> int:
         """Write a register and read it back: the card rounds some values and snaps others.
@@ -162,21 +150,9 @@ class AwgCard:
             raise DeviceError(self.name, f"{name} was set to {value}, and the card reads {actual}")
         return actual
 
-    def write_list(self, entries: NDArray[np.void], action: str) -> None:
-        """Write many registers in one call; ``spcm``'s own ``register_list`` overruns its 1024 entries.
-
-        Args:
-            entries: (n,), as the driver library's ``ST_LIST_PARAM``: register, type, value.
-            action: What it does, for messages.
-        """
-        address = ctypes.c_void_p(entries.ctypes.data)
-        with self._translated_errors(action):
-            self._card.set_ptr(self.spcm.SPC_REGISTER_LIST, address, entries.nbytes)
-
     def command(self, command: int, action: str) -> None:
         """Send a command, one or several M2CMD bits."""
-        with self._translated_errors(action):
-            self._card.set_i(self.spcm.SPC_M2CMD, command)
+        self._check(self.spcm.spcm_dwSetParam_i64(self._handle, self.spcm.SPC_M2CMD, command), action)
 
     def write_setup(self) -> None:
         """Send the settings to the card: until then, or until the start, only its driver has them."""
@@ -186,39 +162,31 @@ class AwgCard:
         """Name the samples of the next transfer; the array must live until the transfer is over."""
         spcm, address = self.spcm, ctypes.c_void_p(frames.ctypes.data)
         kind, direction = spcm.SPCM_BUF_DATA, spcm.SPCM_DIR_PCTOCARD
-        handle = self._card.handle()
-        if spcm.spcm_dwDefTransfer_i64(handle, kind, direction, notify_bytes, address, 0, frames.nbytes):
-            raise DeviceError(self.name, f"naming the transfer buffer: {self.clear_error()}")
+        self._check(
+            spcm.spcm_dwDefTransfer_i64(
+                self._handle, kind, direction, notify_bytes, address, 0, frames.nbytes
+            ),
+            "naming the transfer buffer",
+        )
 
     def upload(self, frames: NDArray[np.int16], poll_s: float = POLL_S) -> None:
-        """Transfer samples to the on-board memory, and wait until they have arrived."""
+        """Transfer samples to the on-board memory, and wait until they have arrived.
+
+        Raises:
+            DeviceTimeoutError: They take too long.
+        """
         self.define_transfer(frames)
         self.command(self.spcm.M2CMD_DATA_STARTDMA, "upload")
         limit_s = frames.nbytes / 0.5e9 + TRANSFER_TIMEOUT_S  # every slot for the card reaches 0.5 GB/s
-        text = f"{frames.nbytes} bytes were not uploaded"
-        self.wait_until(lambda: bool(self.status & self.spcm.M2STAT_DATA_END), text, limit_s, poll_s)
-
-    def wait_until(
-        self,
-        is_done: Callable[[], bool],
-        text: str,
-        limit_s: float = TRANSFER_TIMEOUT_S,
-        poll_s: float = POLL_S,
-    ) -> None:
-        """Wait for something that the card does by itself.
-
-        Raises:
-            DeviceTimeoutError: It takes too long; with this text.
-        """
         deadline_s = self.clock.now() + limit_s
-        while not is_done():
+        while not self.status & self.spcm.M2STAT_DATA_END:
             if self.clock.now() > deadline_s:
-                raise DeviceTimeoutError(self.name, text, limit_s)
+                raise DeviceTimeoutError(self.name, f"{frames.nbytes} bytes were not uploaded", limit_s)
             self.clock.sleep(poll_s)
 
     def stop(self) -> None:
         """Stop playing and transferring; no effect if it does neither."""
         spcm = self.spcm
         self.command(spcm.M2CMD_CARD_STOP | spcm.M2CMD_DATA_STOPDMA, "stop")
-        if spcm.spcm_dwInvalidateBuf(self._card.handle(), spcm.SPCM_BUF_DATA):
-            raise DeviceError(self.name, f"releasing the transfer buffer: {self.clear_error()}")
+        code = spcm.spcm_dwInvalidateBuf(self._handle, spcm.SPCM_BUF_DATA)
+        self._check(code, "releasing the transfer buffer")

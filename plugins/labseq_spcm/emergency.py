@@ -2,7 +2,7 @@
 
 labseq's watchdog loads this file by its path after the run that used the card has died. It needs nothing
 but Python's standard library. The order: stop, so that the outputs go to their stop level of 0 V; lowest
-amplitude; output relays open, which takes effect with WRITESETUP only; DDS reset; reset of the card, which
+amplitude; output relays open, which takes effect with WRITESETUP only; reset of the card, which
 disables its outputs even if the library, new in this process, should take them for disabled already.
 """
 
@@ -17,7 +17,6 @@ from typing import Any
 SPC_M2CMD, SPC_M2STATUS = 100, 110
 SPC_AMP0, SPC_AMP1 = 30010, 30110
 SPC_ENABLEOUT0, SPC_ENABLEOUT1 = 30091, 30191
-SPC_DDS_CMD, SPCM_DDS_CMD_RESET = 608003, 1
 M2CMD_CARD_RESET, M2CMD_CARD_WRITESETUP = 0x1, 0x2
 M2CMD_CARD_STOP, M2CMD_DATA_STOPDMA = 0x40, 0x40000
 M2STAT_CARD_READY = 0x4
@@ -31,7 +30,7 @@ class EmergencyError(Exception):
     """The card could not be switched off; the text says why."""
 
 
-def prepare(library: str, card: str, mode: str) -> None:  # noqa: ARG001 - the arguments are those of off()
+def prepare(library: str, card: str) -> None:
     """Load the driver library; does not touch the card.
 
     Raises:
@@ -42,13 +41,12 @@ def prepare(library: str, card: str, mode: str) -> None:  # noqa: ARG001 - the a
     load(library)
 
 
-def off(library: str, card: str, mode: str) -> str:
+def off(library: str, card: str) -> str:
     """Stop the card, disable both outputs, and close it; a card that is off stays off.
 
     Args:
         library: The driver library.
         card: The card's device name.
-        mode: "dds" for a card that makes the tones itself.
 
     Returns:
         What was done.
@@ -56,10 +54,10 @@ def off(library: str, card: str, mode: str) -> str:
     Raises:
         EmergencyError: The card cannot be opened, or refuses; the text is the driver library's.
     """
-    prepare(library, card, mode)
+    prepare(library, card)
     device = _Card(load(library), card)
     try:
-        return device.switch_off(is_dds=mode == "dds")
+        return device.switch_off()
     finally:
         device.close()
 
@@ -100,7 +98,7 @@ class _Card:
             time.sleep(1e-3)
         self._handle = handle
 
-    def switch_off(self, *, is_dds: bool) -> str:
+    def switch_off(self) -> str:
         """All steps, also after one that was refused; then check that the card took them."""
         steps: list[tuple[int, int, str]] = [
             (SPC_M2CMD, M2CMD_CARD_STOP | M2CMD_DATA_STOPDMA, "stop"),
@@ -109,7 +107,6 @@ class _Card:
             (SPC_ENABLEOUT0, 0, "disabling output 0"),
             (SPC_ENABLEOUT1, 0, "disabling output 1"),
             (SPC_M2CMD, M2CMD_CARD_WRITESETUP, "writing the set-up"),
-            *([(SPC_DDS_CMD, SPCM_DDS_CMD_RESET, "reset of the DDS")] if is_dds else []),
             (SPC_M2CMD, M2CMD_CARD_RESET, "reset of the card"),
         ]
         refused: dict[str, str] = {}

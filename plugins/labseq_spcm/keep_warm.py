@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import Context, LimitError, format_quantity
-from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.settings import KeepWarmSettings
-
-PERIOD: Final = 1 << 16
-"""Samples of the loop: the tones are at multiples of 10 kHz at 625 MS/s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,28 +86,3 @@ def tone_samples(
         turns = np.arange(n_samples) * periods % n_samples / n_samples
         frames[:, channel] = np.rint(32767 * tones.amplitude[axis] * np.cos(2 * np.pi * turns))
     return frames
-
-
-class Loop:
-    """Plays the tones from the card's memory, over and over, until the card is stopped.
-
-    Args:
-        card: The open card.
-        tones: The tones.
-        sample_rate_hz: The rate that the card's clock really makes.
-        row_channel: The output of the row axis, 0 or 1.
-    """
-
-    def __init__(self, card: AwgCard, tones: KeepWarm, sample_rate_hz: float, row_channel: int) -> None:
-        self._card = card
-        self._frames = Buffer().reserve(PERIOD)
-        self._frames[:] = tone_samples(tones, sample_rate_hz, row_channel, PERIOD)
-
-    def start(self) -> None:
-        """Start it, in the mode STD_SINGLE; the card stands still."""
-        card, spcm = self._card, self._card.spcm
-        card.set(spcm.SPC_LOOPS, 0, "loops")
-        card.set(spcm.SPC_MEMSIZE, PERIOD, "memory size")
-        card.upload(self._frames)
-        start = spcm.M2CMD_CARD_START | spcm.M2CMD_CARD_ENABLETRIGGER | spcm.M2CMD_CARD_FORCETRIGGER
-        card.command(start, "start of the keep-warm tones")

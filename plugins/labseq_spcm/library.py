@@ -7,7 +7,7 @@ import ctypes
 import importlib
 import io
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -26,7 +26,7 @@ LIBRARY: Final = "spcm_win64.dll" if os.name == "nt" else "libspcm_linux.so"
 def simulated_settings() -> dict[str, str | int] | str:
     """Settings of a simulated card, which the vendor's Python package plays on, or why there is none here."""
     simulated: dict[str, str | int] = {"card": "simulated", "trigger": "software", "serial": 0}
-    return missing_package("spcm") or simulated
+    return missing_package("spcm_core") or simulated
 
 
 class VendorLibrary:
@@ -40,14 +40,14 @@ class VendorLibrary:
         self._device_name = device_name
 
     def load(self) -> Any:
-        """Import the package ``spcm``, which loads the library."""
-        return importlib.import_module("spcm")
+        """Import the package ``spcm_core``, which loads the library."""
+        return importlib.import_module("spcm_core")
 
     def warm(self) -> None:
         """Do what takes long before the first shot: nothing."""
 
     def connect(self) -> str:
-        """Make the card available; returns its device name in ``spcm``."""
+        """Make the card available; returns its device name."""
         return self._device_name
 
     def disconnect(self) -> None:
@@ -55,7 +55,7 @@ class VendorLibrary:
 
     def functions(self) -> tuple[int, int]:
         """Addresses of the C functions that read and that write a register of 64 bits."""
-        module = importlib.import_module("spcm_core.pyspcm")
+        module = importlib.import_module("spcm_core")
         functions = module.spcm_dwGetParam_i64, module.spcm_dwSetParam_i64_
         get, put = (ctypes.cast(function, ctypes.c_void_p).value or 0 for function in functions)
         return get, put
@@ -69,9 +69,9 @@ class VendorLibrary:
         """
         return False
 
-    def emergency(self, script: Path, arguments: Mapping[str, Any]) -> Emergency | None:
+    def emergency(self, script: Path) -> Emergency | None:
         """The driver's script that switches the card off from another process, with the vendor's library."""
-        return Emergency(script, {**arguments, "library": LIBRARY, "card": self._device_name})
+        return Emergency(script, {"library": LIBRARY, "card": self._device_name})
 
 
 Library: TypeAlias = "VendorLibrary | SimulatedLibrary"
@@ -81,7 +81,7 @@ def choose_library(name: str, settings: SpcmSettings, context: Context) -> Libra
     """The library that the setting ``card`` asks for.
 
     Raises:
-        DeviceError: The package ``spcm`` is missing, from which the simulated card has its registers.
+        DeviceError: The package ``spcm_core`` is missing, from which the simulated card has its registers.
     """
     if not settings.card.startswith(SIMULATED):
         return VendorLibrary(settings.card)
@@ -93,7 +93,7 @@ def choose_library(name: str, settings: SpcmSettings, context: Context) -> Libra
 
 
 def load_spcm(name: str, library: Library) -> Any:
-    """Import the package ``spcm``.
+    """Import the package ``spcm_core``.
 
     Args:
         name: Name of the device, for the message.
@@ -103,19 +103,17 @@ def load_spcm(name: str, library: Library) -> Any:
         DeviceError: The package or the library is missing.
     """
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # spcm prints, and stdout may be for JSON
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints, and stdout may be for JSON
             return library.load()
     except ModuleNotFoundError as error:
         raise _not_installed(name, error) from error
-    except Exception as error:  # spcm raises a bare Exception without the library
+    except Exception as error:  # it raises a bare Exception without the library
         reason = (str(error).splitlines() or [type(error).__name__])[0].partition(". ")[0].rstrip(".")
-        text = f"the Python package 'spcm' finds no driver library ({reason}); install Spectrum's driver"
+        text = f"the Python package 'spcm_core' finds no driver library ({reason}); install Spectrum's driver"
         hint = "to try things without a card, set `card: simulated`"
         raise DeviceError(name, f"{text} for this system; {hint}") from error
 
 
 def _not_installed(name: str, error: ModuleNotFoundError) -> DeviceError:
-    text = (
-        f"the Python package 'spcm' cannot be imported ({error}); install it with {install_hint('', 'spcm')}"
-    )
-    return DeviceError(name, text)
+    text = f"the Python package 'spcm_core' cannot be imported ({error})"
+    return DeviceError(name, f"{text}; install it with {install_hint('', 'spcm_core')}")

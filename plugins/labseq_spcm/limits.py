@@ -1,8 +1,7 @@
 """Figures of the card, and the checks of the set-up against them (memory: ``replay_fifo.py``).
 
 Source of the figures, where no other is named: Spectrum's manual "M4i.66xx/M4i.96xx", chapters on
-analog outputs, clock, generation modes, trigger and DDS20. Figures marked (EDMSuite) were measured
-on an M4i.9622 by ColdMatter/EDMSuite.
+analog outputs, clock, generation modes and trigger.
 """
 
 from __future__ import annotations
@@ -39,23 +38,6 @@ SAMPLE_STEP: Final = 32
 """Memory sizes are multiples of this, in samples per channel."""
 TRIGGER_STEP_MV: Final = 10
 """The card rounds the level of Ext0 to this."""
-
-DDS_RATE_HZ: Final = 1.25e9
-"""The DDS runs at the full sample rate."""
-DDS_TICK_S: Final = 6.4e-9
-"""Resolution of the DDS timer."""
-DDS_MIN_TICKS: Final = 13
-"""Shortest time between two blocks of commands: 83.2 ns."""
-DDS_FREQUENCY_SLOPE: Final = 1.9e14
-"""Largest slope of a frequency, in Hz/s (EDMSuite)."""
-DDS_AMPLITUDE_SLOPE: Final = 3.05e5
-"""Largest slope of an amplitude, in 1/s (EDMSuite)."""
-DDS_COMMANDS_PER_S: Final = 10e6
-"""Rate at which commands reach the DDS by DMA (EDMSuite)."""
-FOLLOWS_M: Final = 20e-9
-"""Largest distance of a tweezer from a curved course: a tenth of an atom's thermal spread (ours)."""
-DDS_DELAY_S: Final = 560e-9
-"""From the trigger to the output (EDMSuite)."""
 
 
 def trigger_delay_s(sample_rate_hz: float) -> float:

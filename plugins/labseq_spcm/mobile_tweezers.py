@@ -1,7 +1,7 @@
 """Mobile tweezers on a Spectrum M4i.66xx arbitrary waveform generator.
 
-The order of calls follows the manual: in ``open`` the card is identified, reset and set up (``set_up.py``),
-then its mode; in ``settle`` the outputs; in ``prepare`` the data, in ``play`` the start and the trigger.
+In the manual's order: in ``open`` the card is identified, reset and set up (``set_up.py``), then its mode; in
+``settle`` the outputs; in ``prepare`` the data, in ``play`` the start and the trigger; then stop and close.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from labseq.plugin.lines import trigger_line
 from labseq.plugin.motion import check_tone_program, comb_sample_rate, warm_rendering
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard, Buffer
-from labseq_spcm.dds import Dds, choose_cores, compile_commands, worst_distance_m
 from labseq_spcm.keep_warm import keep_warm_tones
 from labseq_spcm.library import choose_library, load_spcm
 from labseq_spcm.play_mode import PlayMode
@@ -66,7 +65,7 @@ class SpcmMobileTweezers(MobileTweezers):
     Raises:
         LimitError: The card or the amplifiers cannot do the profile's ``rf.full_scale``, the sample
             rate is too low for its bands, or a keep-warm tone is on the atoms or outside them.
-        ConfigError: The mode is ``dds``, and the profile allows more tones than it has.
+        ConfigError: The mode is ``stream``, and a line triggers the card.
     """
 
     any_thread = True
@@ -82,11 +81,7 @@ class SpcmMobileTweezers(MobileTweezers):
         self._clock = context.clock
         self._rf = context.motion.rf
         self._amplitude_mv = limits.full_scale_mv(self._name, self._rf)
-        self._cores = None
-        if settings.mode == "dds":
-            self._cores = choose_cores(self._name, settings, context.motion, context.grid)
-        else:
-            limits.check_sample_rate(self._name, settings.sample_rate, self._rf)
+        limits.check_sample_rate(self._name, settings.sample_rate, self._rf)
         warm = settings.keep_warm
         self._keep_warm = None if warm is None else keep_warm_tones(self._name, warm, context)
         self.library = choose_library(self._name, settings, context)
@@ -113,26 +108,27 @@ class SpcmMobileTweezers(MobileTweezers):
             f"{hz / 1e6:.6g} MHz ({format_quantity(a**2 * self._rf.full_scale_power_w, 'power')})"
             for hz, a in zip(tones.hz, tones.amplitude, strict=True)
         )
-        dark = ", dark from upload to start" if self._settings.mode in ("replay", "fifo") else ""
-        return f"keep-warm tones off the atoms: {' and '.join(texts)}{dark}"
+        return f"keep-warm tones off the atoms: {' and '.join(texts)}"
+
+    @property
+    def settling_timeout_s(self) -> float:
+        """Time for the output relays."""
+        return limits.RELAY_S
+
+    @property
+    def start_delay_s(self) -> float:
+        """Delay of the outputs; in the mode ``stream`` with the silence ahead of them."""
+        return float(self._facts.get("trigger_delay_s", 0.0))
+
+    @property
+    def beginning_s(self) -> float:
+        """A fraction of a program's length for the mode ``stream``."""
+        return math.inf if self._mode is None else self._mode.beginning_s
 
     def warnings(self) -> list[str]:
-        """A course that the mode ``dds`` cannot follow closely enough, a rate that is slow to render."""
-        if self._settings.mode == "stream":
-            return self._slow_rendering()
-        motion = self._context.motion
-        worst_m = 0.0 if self._cores is None else worst_distance_m(self._context.grid, motion)
-        if worst_m <= limits.FOLLOWS_M:
-            return []
-        worst, aim = (format_quantity(m, "length") for m in (worst_m, limits.FOLLOWS_M))
-        n_tones = f"{motion.max_row_tones} row and {motion.max_column_tones} column tones"
-        what = f"profile.{self._name}.speed_profile is {motion.speed_profile}; in the mode dds {n_tones}"
-        why = f"as the card takes {limits.DDS_COMMANDS_PER_S / 1e6:g} million commands per second"
-        remedy = "allow fewer tones, lower the speed, or use the mode replay"
-        return [f"{what} follow it within {worst} only, not {aim}, {why}; {remedy}"]
-
-    def _slow_rendering(self) -> list[str]:
         """The sample rate of a stream, if another one is rendered several times faster."""
+        if self._settings.mode != "stream":
+            return []
         rate_hz = self._settings.sample_rate
         try:
             best_hz = comb_sample_rate(self._context.grid, rate_hz)
@@ -153,9 +149,16 @@ class SpcmMobileTweezers(MobileTweezers):
         """
         load_spcm(self._name, self.library)
         importlib.import_module("labseq_spcm.kernels")
-        if self._settings.mode != "dds":
-            warm_rendering()
+        warm_rendering()
         self.library.warm()
+
+    def check_program(self, program: ToneProgram) -> None:
+        """Refuse a program that has no length, leaves an AOD's band, or clips.
+
+        Raises:
+            LimitError: It does.
+        """
+        check_tone_program(self._name, program, self._rf.row_band_hz, self._rf.column_band_hz)
 
     def open(self) -> None:
         """Open the card and set it up, outputs off; no effect if it is open.
@@ -177,8 +180,6 @@ class SpcmMobileTweezers(MobileTweezers):
             raise
 
     def _new_mode(self, card: AwgCard) -> PlayMode:
-        if self._cores is not None:
-            return Dds(card, self._cores, self._keep_warm)
         rate_hz = self._facts["sample_rate_hz"]
         if self._settings.mode == "stream":
             if not self._clock.virtual:  # virtual time waits for the rendering
@@ -187,12 +188,7 @@ class SpcmMobileTweezers(MobileTweezers):
             self._facts["trigger_delay_s"] = stream.delay_s
             return stream
         mode = Replay if self._settings.mode == "replay" else Fifo
-        return mode(card, self._settings, rate_hz, self._keep_warm)
-
-    @property
-    def settling_timeout_s(self) -> float:
-        """Time for the output relays."""
-        return limits.RELAY_S
+        return mode(card, self._settings, rate_hz)
 
     def settle(self) -> None:
         """Close the output relays and let them settle, once per run, before there are atoms.
@@ -202,38 +198,8 @@ class SpcmMobileTweezers(MobileTweezers):
         card, mode = self._opened()
         if close_relays(card):
             self._clock.sleep(limits.RELAY_S)
-        self._play_idle(card, mode)
+        mode.idle()
         self._is_settled = True
-
-    def _play_idle(self, card: AwgCard, mode: PlayMode) -> None:
-        """Have the keep-warm tones play, or the stream."""
-        if (self._keep_warm is not None or self._settings.mode == "stream") and not card.running:
-            mode.idle()
-
-    def close(self) -> None:
-        """Bring the outputs into the safe state and close the card; legal in any state."""
-        try:
-            self.safe_state()
-        finally:
-            self._disconnect()
-
-    def _disconnect(self) -> None:
-        card, self._card, self._mode = self._card, None, None
-        if card is not None:
-            card.close()
-
-    def check_program(self, program: ToneProgram) -> None:
-        """Refuse a program that has no length, leaves an AOD's band, clips, or is too much for the DDS.
-
-        Raises:
-            LimitError: It does.
-        """
-        self._check_limits(program)
-        if self._cores is not None:
-            compile_commands(self._name, program, self._cores)
-
-    def _check_limits(self, program: ToneProgram) -> None:
-        check_tone_program(self._name, program, self._rf.row_band_hz, self._rf.column_band_hz)
 
     def prepare(self, program: ToneProgram) -> float:
         """Render a program and transfer it to the card.
@@ -245,53 +211,24 @@ class SpcmMobileTweezers(MobileTweezers):
             LimitError: It has no length, leaves an AOD's band, clips, or is too much for the mode.
             DeviceError: Not open, still playing, or the card refuses.
         """
-        return self._prepare(program, continues=False)
-
-    @property
-    def start_delay_s(self) -> float:
-        """Delay of the outputs; in the mode ``stream`` with the silence ahead of them."""
-        return float(self._facts.get("trigger_delay_s", 0.0))
-
-    @property
-    def beginning_s(self) -> float:
-        """A fraction of a program's length for the modes ``stream`` and ``dds``."""
-        return math.inf if self._mode is None else self._mode.beginning_s
-
-    def prepare_beginning(self, program: ToneProgram) -> float:
-        """The same, for the beginning of a program."""
-        return self._prepare(program, continues=True)
-
-    def _prepare(self, program: ToneProgram, *, continues: bool) -> float:
         mode = self._opened()[1]
         self._check_idle("prepare()")
         self._duration_s = None
         start_s = time.perf_counter()
-        self._check_limits(program)
+        self.check_program(program)
         took_s = time.perf_counter() - start_s
         if not self._is_settled:
             self.settle()
         start_s = time.perf_counter()
-        playing_s = mode.prepare(program, continues=continues)
+        playing_s = mode.prepare(program)
         took_s += time.perf_counter() - start_s
         self._timings = {"render": mode.render_s, "upload": took_s - mode.render_s}
-        duration_s = max(playing_s, program.total_duration_s) + self.start_delay_s
-        self._duration_s = duration_s
-        return duration_s
+        self._duration_s = max(playing_s, program.total_duration_s) + self.start_delay_s
+        return self._duration_s
 
-    def append(self, program: ToneProgram) -> None:
-        """Have the rest of a program follow its beginning, which plays.
-
-        Raises:
-            LimitError: It has no length, leaves an AOD's band, clips, or is too much for the mode.
-            DeviceError: Not open, nothing plays, or the card refuses.
-        """
-        mode = self._opened()[1]
-        if self._due_s is None:
-            raise DeviceError(
-                self._name, "append() while nothing plays; call prepare_beginning() and play() first"
-            )
-        self._check_limits(program)
-        self._due_s += max(mode.append(program), program.total_duration_s)
+    def prepare_beginning(self, program: ToneProgram) -> float:
+        """As ``prepare``: a stream plays silence when nothing follows."""
+        return self.prepare(program)
 
     def timings(self) -> Mapping[str, float]:
         """Times of the last ``prepare`` on this computer's clock, in seconds: rendering, and the rest."""
@@ -318,6 +255,21 @@ class SpcmMobileTweezers(MobileTweezers):
             command |= spcm.M2CMD_CARD_FORCETRIGGER
         mode.start(command)
 
+    def append(self, program: ToneProgram) -> None:
+        """Have the rest of a program follow its beginning, which plays.
+
+        Raises:
+            LimitError: It has no length, leaves an AOD's band, clips, or is too much for the mode.
+            DeviceError: Not open, nothing plays, or the card refuses.
+        """
+        mode = self._opened()[1]
+        if self._due_s is None:
+            raise DeviceError(
+                self._name, "append() while nothing plays; call prepare_beginning() and play() first"
+            )
+        self.check_program(program)
+        self._due_s += max(mode.append(program), program.total_duration_s)
+
     def wait(self, timeout_s: float) -> None:
         """Wait until the program has been played to its end; returns at once if none is playing.
 
@@ -336,13 +288,11 @@ class SpcmMobileTweezers(MobileTweezers):
             while not mode.finished():
                 now_s = self._clock.now()
                 if now_s >= deadline_s:
-                    raise self._timeout(mode, timeout_s)
+                    raise self._timeout(card, timeout_s)
                 idle_s = max(POLL_S, due_s - now_s) if math.isfinite(due_s) else POLL_S
                 self._clock.sleep(min(deadline_s - now_s, mode.max_wait_s, idle_s))
                 if self._due_s is None:
                     break
-            if self._due_s is not None:
-                self._play_idle(card, mode)
         except (DeviceError, TransientError):
             if self._due_s is not None:
                 self.safe_state()
@@ -351,9 +301,9 @@ class SpcmMobileTweezers(MobileTweezers):
             raise DeviceError(self._name, "stopped by safe_state() while it played")
         self._due_s = None
 
-    def _timeout(self, mode: PlayMode, timeout_s: float) -> DeviceTimeoutError:
+    def _timeout(self, card: AwgCard, timeout_s: float) -> DeviceTimeoutError:
         waited = format_quantity(timeout_s, "time")
-        if mode.triggered():
+        if card.triggered:
             text = f"still playing after {waited}"
         else:
             text = f"no trigger came within {waited}; check the cable at Ext0 and trigger_level"
@@ -390,11 +340,6 @@ class SpcmMobileTweezers(MobileTweezers):
         if failures:
             raise failures[0]
 
-    def emergency(self) -> Emergency | None:
-        """The card is stopped, and its outputs are disabled, by the vendor's library alone."""
-        script = Path(__file__).with_name("emergency.py")
-        return None if self._card is None else self.library.emergency(script, {"mode": self._settings.mode})
-
     def _ramp_down(self, card: AwgCard) -> None:
         """Lower the amplitude in steps within 0.3 ms, in the amplifier's present path."""
         above_relay = limits.RELAY_MV[1] + 1
@@ -403,6 +348,23 @@ class SpcmMobileTweezers(MobileTweezers):
             self._clock.sleep(0.3e-3 / RAMP_STEPS)
             drop_mv = (self._amplitude_mv - end_mv) * step / RAMP_STEPS
             set_amplitude(card, round(self._amplitude_mv - drop_mv))
+
+    def close(self) -> None:
+        """Bring the outputs into the safe state and close the card; legal in any state."""
+        try:
+            self.safe_state()
+        finally:
+            self._disconnect()
+
+    def _disconnect(self) -> None:
+        card, self._card, self._mode = self._card, None, None
+        if card is not None:
+            card.close()
+
+    def emergency(self) -> Emergency | None:
+        """The card is stopped, and its outputs are disabled, by the vendor's library alone."""
+        script = Path(__file__).with_name("emergency.py")
+        return None if self._card is None else self.library.emergency(script)
 
     def self_test(self) -> None:
         """Check the card's firmware, temperatures, clock and memory, outputs off; drops the prepared program.

@@ -30,7 +30,7 @@ class PlayMode(ABC):
         self._card = card
 
     @abstractmethod
-    def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:
+    def prepare(self, program: ToneProgram) -> float:
         """Transfer a program, or the beginning of one, to the card; returns the playing time in seconds.
 
         Raises:
@@ -58,10 +58,6 @@ class PlayMode(ABC):
             LimitError: It cannot play this one.
         """
         raise DeviceError(self._card.name, "this mode plays whole programs only")
-
-    def triggered(self) -> bool:
-        """Whether the program has begun."""
-        return self._card.triggered
 
     def idle(self) -> None:
         """Start what plays between programs, if anything does."""

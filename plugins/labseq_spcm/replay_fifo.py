@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from abc import abstractmethod
 from typing import Final
 
 import numpy as np
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 from labseq.plugin import DeviceError, DeviceTimeoutError, LimitError, ToneProgram, TransientError
 from labseq.plugin.motion import Renderer
 from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard, Buffer
-from labseq_spcm.keep_warm import KeepWarm, Loop
 from labseq_spcm.limits import FRAME_BYTES, SAMPLE_STEP
 from labseq_spcm.play_mode import PlayMode
 from labseq_spcm.settings import SpcmSettings
@@ -62,55 +60,20 @@ class InterleavedRenderer:
             interleave(first_words, second_words, frames[first : first + CHUNK])
 
 
-class SampleMode(PlayMode):
-    """Base of ``replay`` and ``fifo``: rendered samples, and a loop for the keep-warm tones.
-
-    Args:
-        card: The open card.
-        settings: The driver's settings.
-        sample_rate_hz: The rate that the card's clock really makes.
-        keep_warm: The tones between programs; None for silence.
-    """
-
-    def __init__(
-        self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None
-    ) -> None:
-        super().__init__(card)
-        self._row_channel = settings.row_channel
-        self._rate_hz = sample_rate_hz
-        self._loop = keep_warm and Loop(card, keep_warm, sample_rate_hz, settings.row_channel)
-
-    @abstractmethod
-    def _set_mode(self) -> None:
-        """Set up the mode of the programs; the card stands still."""
-
-    def idle(self) -> None:
-        """Start the keep-warm tones if there are any; the card stands still."""
-        if self._loop is not None:
-            spcm = self._card.spcm
-            self._card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
-            self._loop.start()
-
-    def _stop(self) -> None:
-        """Stop what plays, also the keep-warm tones."""
-        self._card.stop()
-        if self._loop is not None:
-            self._set_mode()
-
-
-class Replay(SampleMode):
+class Replay(PlayMode):
     """Mode ``replay``: uploads the whole program, then waits for its end."""
 
-    def __init__(
-        self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None = None
-    ) -> None:
-        super().__init__(card, settings, sample_rate_hz, keep_warm)
+    def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
+        super().__init__(card)
+        self._row_channel, self._rate_hz = settings.row_channel, sample_rate_hz
         self._buffer = Buffer()
-        self._set_mode()
         spcm = card.spcm
+        card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
+        card.set(spcm.SPC_LOOPS, 1, "loops")
+        card.write_setup()
         self._memory_samples = card.read(spcm.SPC_PCIMEMSIZE) // FRAME_BYTES
 
-    def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:  # noqa: ARG002
+    def prepare(self, program: ToneProgram) -> float:
         """Render and upload a program; returns its playing time in seconds."""
         start_s = time.perf_counter()
         renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
@@ -123,23 +86,17 @@ class Replay(SampleMode):
         frames = self._buffer.reserve(n_samples)
         renderer.write(0, frames)
         self.render_s = time.perf_counter() - start_s
-        self._stop()
+        self._card.stop()
         self._card.set(self._card.spcm.SPC_MEMSIZE, n_samples, "memory size")
         self._card.upload(frames)
         return n_samples / self._rate_hz
-
-    def _set_mode(self) -> None:
-        spcm = self._card.spcm
-        self._card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
-        self._card.set(spcm.SPC_LOOPS, 1, "loops")
-        self._card.write_setup()
 
     def finished(self) -> bool:
         """Whether the program has been played to its end."""
         return not self._card.running
 
 
-class Fifo(SampleMode):
+class Fifo(PlayMode):
     """Mode ``fifo``: streams a program while the rest is still being rendered.
 
     Rendered chunks go into a ring in the computer, from there over the bus into the card's memory,
@@ -150,10 +107,9 @@ class Fifo(SampleMode):
 
     max_wait_s = 0.0
 
-    def __init__(
-        self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float, keep_warm: KeepWarm | None = None
-    ) -> None:
-        super().__init__(card, settings, sample_rate_hz, keep_warm)
+    def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
+        super().__init__(card)
+        self._row_channel, self._rate_hz = settings.row_channel, sample_rate_hz
         self._ring = Buffer().reserve(RING_CHUNKS * CHUNK)
         self._half_ring_s = RING_CHUNKS / 2 * CHUNK / sample_rate_hz
         self._renderer: InterleavedRenderer | None = None
@@ -161,23 +117,20 @@ class Fifo(SampleMode):
         ahead = int(settings.fill_s * sample_rate_hz) * FRAME_BYTES - self._ring.nbytes
         # of the on-board memory, in bytes; the card takes powers of two
         self._fill = 1 << round(math.log2(max(1 << 20, ahead)))
-        self._set_mode()
-
-    def _set_mode(self) -> None:
-        card, spcm = self._card, self._card.spcm
+        spcm = card.spcm
         card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_FIFO_SINGLE, "card mode")
         card.set(spcm.SPC_LOOPS, 1, "loops")
         card.set(spcm.SPC_DATA_OUTBUFSIZE, self._fill, "size of the card's FIFO in bytes")
         card.write_setup()  # the buffer of a transfer is named afterwards
 
-    def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:  # noqa: ARG002
+    def prepare(self, program: ToneProgram) -> float:
         """Fill ring and card with the beginning of a program; returns its playing time in seconds."""
         card, spcm = self._card, self._card.spcm
         start_s = time.perf_counter()
         self._renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
         self.render_s = time.perf_counter() - start_s
         self._n_samples, self._n_rendered = self._renderer.n_samples, 0
-        self._stop()
+        card.stop()
         card.set(spcm.SPC_SEGMENTSIZE, self._n_samples, "number of samples")
         card.define_transfer(self._ring, CHUNK * FRAME_BYTES)
         self._feed()

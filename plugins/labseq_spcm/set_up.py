@@ -19,7 +19,7 @@ def check_type(card: AwgCard, settings: SpcmSettings) -> None:
     """Check that it is the card that the settings name, and that it can do what they ask for.
 
     Raises:
-        DeviceError: It is another one, too slow, or without DDS.
+        DeviceError: It is another one, or too slow.
     """
     spcm = card.spcm
     n_channels = card.read(spcm.SPC_MIINST_MODULES) * card.read(spcm.SPC_MIINST_CHPERMODULE)
@@ -30,10 +30,6 @@ def check_type(card: AwgCard, settings: SpcmSettings) -> None:
     if settings.serial and card.serial_number != settings.serial:
         text = f"the card '{settings.card}' has the serial number {card.serial_number}"
         raise DeviceError(card.name, f"{text}; expected {settings.serial}: name another one as `card`")
-    if settings.mode == "dds":
-        if not card.read(spcm.SPC_PCIEXTFEATURES) & spcm.SPCM_FEAT_EXTFW_DDS20:
-            raise DeviceError(card.name, f"the {card.product} was bought without DDS; use mode: replay")
-        return
     fastest_hz, rate_hz = card.read(spcm.SPC_MIINST_MAXADCLOCK), settings.sample_rate
     if rate_hz > fastest_hz:
         text = f"the {card.product} makes at most {fastest_hz / 1e6:g} MS/s"
@@ -47,13 +43,12 @@ def set_up(card: AwgCard, settings: SpcmSettings, amplitude_mv: int) -> dict[str
     rate_hz = _set_clock(card, settings)
     _set_outputs(card, amplitude_mv)
     _set_trigger(card, settings)
-    is_dds = settings.mode == "dds"
     return {
         "model": card.product,
         "serial_number": card.serial_number,
         "driver_version": _version(card, card.spcm.SPC_GETDRVVERSION),
         "sample_rate_hz": rate_hz,
-        "trigger_delay_s": limits.DDS_DELAY_S if is_dds else limits.trigger_delay_s(rate_hz),
+        "trigger_delay_s": limits.trigger_delay_s(rate_hz),
         "amplitude_mv": amplitude_mv,
         "trigger_level_mv": card.read(card.spcm.SPC_TRIG_EXT0_LEVEL0),
     }
@@ -63,7 +58,7 @@ def versions(card: AwgCard) -> dict[str, tuple[str, str]]:
     """Versions of the vendor's software and of the firmware: installed, tested; no real card was tested."""
     spcm = card.spcm
     return {
-        "package spcm": (metadata.version("spcm"), "1.13.4"),
+        "package spcm_core": (metadata.version("spcm_core"), "1.0.11"),
         "driver": (_version(card, spcm.SPC_GETDRVVERSION), ""),
         "kernel driver": (_version(card, spcm.SPC_GETKERNELVERSION), ""),
         "main control firmware": (str(card.read(spcm.SPCM_FW_CTRL) & 0xFFFF), ""),
@@ -84,8 +79,8 @@ def _set_clock(card: AwgCard, settings: SpcmSettings) -> float:
     else:
         card.set(spcm.SPC_CLOCKMODE, spcm.SPC_CM_EXTREFCLOCK, "clock mode")
         card.set(spcm.SPC_REFERENCECLOCK, round(reference_hz), "reference clock in Hz")
-    rate_hz = limits.DDS_RATE_HZ if settings.mode == "dds" else settings.sample_rate
-    return float(card.set(spcm.SPC_SAMPLERATE, round(rate_hz), "sample rate in Hz", limits.RATE_STEP_HZ))
+    rate_hz = round(settings.sample_rate)
+    return float(card.set(spcm.SPC_SAMPLERATE, rate_hz, "sample rate in Hz", limits.RATE_STEP_HZ))
 
 
 def _set_outputs(card: AwgCard, amplitude_mv: int) -> None:

@@ -9,7 +9,7 @@ from pydantic import Field, field_validator, model_validator
 from labseq.plugin import Duration, Frequency, Settings, Voltage, format_quantity
 from labseq_spcm import limits
 
-Mode: TypeAlias = Literal["replay", "fifo", "stream", "dds"]
+Mode: TypeAlias = Literal["replay", "fifo", "stream"]
 Channel: TypeAlias = Literal[0, 1]
 
 NO_TRIGGER: Final = (
@@ -35,15 +35,13 @@ class SpcmSettings(Settings):
     card: str = Field(
         default="/dev/spcm0",
         min_length=1,
-        description="device name in the vendor's driver; `simulated` for a card that exists only in "
-        "software, `simulated@FOLDER/NAME` for one that outlives the process",
+        description="device name in the vendor's driver; `simulated` for a card that exists only in software",
     )
     serial: int = Field(default=0, ge=0, description="serial number that the card must have; 0: any")
     mode: Mode = Field(
         default="replay",
         description="replay: uploaded whole, then played; fifo: streamed while it is being rendered; "
-        "stream: the same, spliced into silence that the card plays all the time; "
-        "dds: the card's own tones, at most 20 + 1 or 16 + 5",
+        "stream: the same, spliced into silence that the card plays all the time",
     )
     sample_rate: Frequency = Field(
         default=625e6, description="samples per second; the card rounds it to 8 Hz"
@@ -93,7 +91,7 @@ class SpcmSettings(Settings):
         description="stream: bytes of on-board memory that are used, a power of two, at least notify_size",
     )
     keep_warm: KeepWarmSettings | None = Field(
-        default=None, description="tones off the atoms between programs; none: silence"
+        default=None, description="stream: tones off the atoms between programs; none: silence"
     )
 
     @field_validator("sample_rate")
@@ -133,6 +131,11 @@ class SpcmSettings(Settings):
     @model_validator(mode="after")
     def _check_stream(self) -> Self:
         if self.mode != "stream":
+            if self.keep_warm is not None:
+                raise ValueError(
+                    f"keep_warm is set, but mode: {self.mode} leaves the AODs dark while it uploads "
+                    "programs; use mode: stream, or leave keep_warm out"
+                )
             return self
         if self.trigger == "external":
             raise ValueError(f"mode: stream {NO_TRIGGER}")
@@ -156,7 +159,7 @@ class SpcmSettings(Settings):
     @property
     def overhead_per_cycle_s(self) -> float:
         """Time from a cycle's plan to its light: measured, see the timing budget."""
-        return {"replay": 20e-3, "fifo": 17e-3, "stream": 3e-3, "dds": 5e-3}[self.mode]
+        return {"replay": 20e-3, "fifo": 17e-3, "stream": 3e-3}[self.mode]
 
     @property
     def fill_s(self) -> float:

@@ -250,7 +250,7 @@ class Stream(PlayMode):
             while box[k.IS_FEEDING] and time.perf_counter() < until_s:
                 time.sleep(50e-6)
 
-    def prepare(self, program: ToneProgram, *, continues: bool = False) -> float:  # noqa: ARG002
+    def prepare(self, program: ToneProgram) -> float:
         """Hand a program to the loop, which renders it until it starts; returns its playing time, s."""
         start_s = time.perf_counter()
         stream = self._prepared = self._new_program(program)
@@ -309,10 +309,6 @@ class Stream(PlayMode):
     def least_ahead_s(self) -> float:
         """Least time by which the last program was written ahead of the card; below 0: too late."""
         return float(self._box[k.LEAST]) / self._rate_hz
-
-    def triggered(self) -> bool:
-        """Whether the program has begun: the stream has no trigger."""
-        return True
 
     def finished(self) -> bool:
         """Whether the program has been played to its end."""

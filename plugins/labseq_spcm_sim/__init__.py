@@ -1,4 +1,4 @@
-"""A Spectrum M4i.6631-x8 simulated at its registers, for the real package ``spcm``.
+"""A Spectrum M4i.6631-x8 simulated at its registers, for the vendor's packages ``spcm_core`` and ``spcm``.
 
     card = SimulatedCard(clock)
     with installed(card) as name, spcm.Card(name) as device:
@@ -11,7 +11,7 @@ The driver ``labseq_spcm`` opens it as a :class:`SimulatedLibrary` where a profi
 
 from labseq_spcm_sim.card import LogEntry, SimulatedCard
 from labseq_spcm_sim.library import CardOutputs, SimulatedLibrary, install, installed, vendor_library_found
-from labseq_spcm_sim.output import SampleSpan, Span, Tone, ToneSpan
+from labseq_spcm_sim.output import SampleSpan
 from labseq_spcm_sim.setup import M4I6631, CardModel, ErrorInfo, trigger_delay_s
 
 __all__ = [
@@ -23,9 +23,6 @@ __all__ = [
     "SampleSpan",
     "SimulatedCard",
     "SimulatedLibrary",
-    "Span",
-    "Tone",
-    "ToneSpan",
     "install",
     "installed",
     "trigger_delay_s",

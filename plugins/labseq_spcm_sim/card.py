@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import mmap
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,22 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import Clock
-from labseq.plugin.native import new_timer
-from labseq_spcm_sim import fifo_kernels as k, registers as r
+from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.machine import Machine
 from labseq_spcm_sim.modes import Buffer
-from labseq_spcm_sim.output import Span
+from labseq_spcm_sim.output import SampleSpan
 from labseq_spcm_sim.setup import M4I6631, CardModel, ErrorInfo, Number, Refusal
 
-LIST_PARAM: Final = np.dtype([("register", "<i4"), ("type", "<i4"), ("value", "<i8")])
-"""One entry of a register list: 16 bytes, the value an integer or a double."""
 DRIVER_VERSION: Final = (7 << 24) | (9 << 16) | 22000
-"""A version that ``spcm`` accepts; the vendor has no such version."""
+"""A version that ``spcm_core`` accepts; the vendor has no such version."""
 LOG_SIZE: Final = 100_000
-KEPT_S: Final = 1.0
-"""How long a stream is kept where nothing receives it."""
-KEPT_BYTES: Final = 1 << 27
-"""Memory for what a stream has played in real time and that has not been read yet: 50 ms at 625 MS/s."""
 EDGE_V: Final = 3.3
 """Height of a pulse at Ext0, of LVTTL."""
 
@@ -48,13 +40,6 @@ class LogEntry:
     value: Number
 
 
-def list_writes(entries: NDArray[np.void]) -> Iterator[tuple[int, Number]]:
-    """The (register, value) of a register list, ``LIST_PARAM`` (n,)."""
-    real: list[float] = entries["value"].copy().view(np.float64).tolist()
-    for (register, kind, whole), value in zip(entries.tolist(), real, strict=True):
-        yield register, value if kind == r.TYPE_DOUBLE else whole
-
-
 class SimulatedCard:
     """A Spectrum M4i.6631-x8 in software, which behaves as the real one.
 
@@ -66,7 +51,7 @@ class SimulatedCard:
         model: What card it is.
         serial_number: Its serial number.
         keep_history: Keep what was played until ``forget``; otherwise each start of the card drops it, and
-            a stream what was played some time ago.
+            nothing of a stream is kept.
 
     Attributes:
         log: The latest register writes, in order.
@@ -93,9 +78,7 @@ class SimulatedCard:
         self._clock = clock
         self._keep_history = keep_history
         self._lock = threading.RLock()
-        self._machine = Machine(model)
-        self._kept = np.empty(0, np.uint8)
-        self._entries = np.empty(0, np.int64)
+        self._machine = Machine(model, keeps_streams=keep_history)
         self._error = ErrorInfo()
         self._edges_s: list[float] = []
         self._step: Callable[[], float | None] | None = None
@@ -142,7 +125,7 @@ class SimulatedCard:
         with self._lock:
             self._step_s = self._held_up_s = self._advance() + duration_s
 
-    def played(self, channel: int) -> list[Span]:
+    def played(self, channel: int) -> list[SampleSpan]:
         """The output of a channel up to now, in time's order; between the spans there is silence."""
         with self._lock:
             return self._machine.played(channel, self._advance())
@@ -181,40 +164,6 @@ class SimulatedCard:
         """Whether the output relays of the two channels are closed."""
         with self._lock:
             return self._machine.amplifiers[0].enabled, self._machine.amplifiers[1].enabled
-
-    @property
-    def streams(self) -> bool:
-        """Whether the transfer buffer is one of the FIFO mode."""
-        return self._machine.fifo is not None
-
-    def direct_words(self, read: int, write: int) -> int:
-        """Let the functions in ``fifo_kernels`` answer calls in real time while a stream plays.
-
-        Args:
-            read: Address of the function in Python that reads a register.
-            write: Of the one that writes one.
-
-        Returns:
-            Address of the words with the card's state.
-        """
-        with self._lock:
-            words = self._machine.words
-            words[k.READ], words[k.WRITE], words[k.TIMER :] = read, write, new_timer(words[k.TIMER :])
-            tries = [(1e9 * self._clock.now(), k.timer_ns(words)) for _ in range(10)]
-            words[k.OFFSET_NS] = max(int(now_ns) - timer_ns for now_ns, timer_ns in tries)
-            if self._keep_history and not self._clock.virtual and not len(self._kept):
-                self._kept = np.frombuffer(mmap.mmap(-1, KEPT_BYTES), np.uint8)
-                self._entries = np.zeros(4 * k.MOST_ENTRIES, np.int64)
-                words[k.KEPT], words[k.N_KEPT] = self._kept.ctypes.data, KEPT_BYTES
-                words[k.ENTRIES] = self._entries.ctypes.data
-            return int(words.ctypes.data)
-
-    def _choose_direct(self) -> None:
-        """Functions in C answer while a stream plays in real time and no error is pending."""
-        machine = self._machine
-        streams = machine.running and machine.fifo is not None
-        is_direct = streams and not self._clock.virtual and not self._error.code
-        machine.words[k.IS_DIRECT] = bool(is_direct and machine.words[k.READ])
 
     # Functions of the driver library; most return the vendor's error code
 
@@ -256,26 +205,22 @@ class SimulatedCard:
             self._machine.advance(edge_s)
             self._machine.pulse(EDGE_V, edge_s)
         self._machine.advance(now_s)
-        self._choose_direct()
         return now_s
 
     def _refused(self, refusal: Refusal, register: int, value: Number) -> int:
         where = f"{r.NAMES.get(register, 'register')} ({register})"
         self._error = ErrorInfo(refusal.code, register, value, f"{where}: {refusal.text}")
-        self._choose_direct()
         return refusal.code
 
     def break_down(self, reason: str) -> None:
         """Lock the driver because of a fault of the simulator."""
         with self._lock:
             self._error = ErrorInfo(r.ERR_INTERNAL_ERROR, text=f"fault of the simulator: {reason}")
-            self._choose_direct()
 
     def take_error(self) -> ErrorInfo:
         """The error that locks the driver, which unlocks it."""
         with self._lock:
             error, self._error = self._error, ErrorInfo()
-            self._choose_direct()
             return error
 
     def write(self, register: int, value: Number) -> int:
@@ -292,13 +237,10 @@ class SimulatedCard:
                 self.log.append(LogEntry(now_s, register, value))
                 if register == r.SPC_M2CMD and int(value) & r.M2CMD_CARD_START and not self._keep_history:
                     self._machine.forget(now_s)
-                elif register == r.SPC_DATA_AVAIL_CARD_LEN and not self._keep_history:
-                    self._machine.forget(now_s - KEPT_S)
                 try:
                     self._machine.write(register, value, now_s)
                 except Refusal as refusal:
                     return self._refused(refusal, register, value)
-            self._choose_direct()
             return r.ERR_OK
 
     def read(self, register: int) -> tuple[int, Number]:

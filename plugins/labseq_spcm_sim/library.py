@@ -1,7 +1,7 @@
 """The driver library, with simulated cards behind its C functions.
 
-``spcm`` loads the vendor's library when it is imported, and keeps its functions. The simulator
-answers that load with C function pointers of its own, so that every call of ``spcm`` goes through
+``spcm_core`` loads the vendor's library when it is imported, and keeps its functions. The simulator
+answers that load with C function pointers of its own, so that every call goes through
 ctypes as with the real library, buffers and pointers included. A call with the handle of a simulated
 card goes to that card. Every other call goes to the vendor's library if there is one, so that real
 and simulated cards can be open side by side.
@@ -15,26 +15,22 @@ import math
 import os
 import sys
 import threading
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from functools import partialmethod
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import numpy as np
 
 from labseq.plugin import Clock, DeviceError, Emergency, Simulation
-from labseq.plugin.native import c_address
 from labseq.plugin.simulation import ReceivesOutput, RfSamples, RfSpan, RfTones
 from labseq_spcm_sim import registers as r
-from labseq_spcm_sim.card import DRIVER_VERSION, LIST_PARAM, SimulatedCard, list_writes
-from labseq_spcm_sim.emergency import PREFIX as SHARED
-from labseq_spcm_sim.fifo_kernels import read_register, write_register
+from labseq_spcm_sim.card import DRIVER_VERSION, SimulatedCard
 from labseq_spcm_sim.modes import Buffer
-from labseq_spcm_sim.output import FULL_SCALE, SampleSpan, Span
+from labseq_spcm_sim.output import FULL_SCALE, SampleSpan
 from labseq_spcm_sim.setup import ErrorInfo, Number
-from labseq_spcm_sim.shared import SharedCard
 
 Slot = ctypes.c_int32 | ctypes.c_uint32 | ctypes.c_int64 | ctypes.c_double
 
@@ -66,7 +62,7 @@ SIGNATURES: Final[dict[str, tuple[Any, tuple[Any, ...]]]] = {
     "spcm_dwDiscovery": (_U32, (_POINTER, _U32, _U32, _U32)),
     "spcm_dwSendIDNRequest": (_U32, (_POINTER, _U32, _U32)),
 }
-"""Name of each function that ``spcm`` needs -> type of its result, types of its arguments."""
+"""Name of each function that ``spcm_core`` needs -> type of its result, types of its arguments."""
 
 
 def typed(library: Any, name: str) -> Any:
@@ -79,7 +75,6 @@ def typed(library: Any, name: str) -> Any:
 LIBRARY: Final = "spcm_win64.dll" if os.name == "nt" else "libspcm_linux.so"
 
 Function = Callable[..., Any]
-Card: TypeAlias = SimulatedCard | SharedCard
 
 
 class Library:
@@ -94,8 +89,8 @@ class Library:
     """
 
     def __init__(self, vendor: Any) -> None:
-        self.cards: dict[str, Card] = {}
-        self._open: dict[int, Card] = {}
+        self.cards: dict[str, SimulatedCard] = {}
+        self._open: dict[int, SimulatedCard] = {}
         self._handles: dict[int, ctypes.Array[ctypes.c_char]] = {}
         self._open_error = ErrorInfo()
         self._vendor = {} if vendor is None else {name: typed(vendor, name) for name in SIGNATURES}
@@ -136,12 +131,6 @@ class Library:
             return (first or b"").decode(errors="replace") in self.cards
         return first in self._handles  # closed ones too: the vendor's library must never see them
 
-    def point_handle_to(self, card: Card, address: int) -> None:
-        """Have the handle of an open card point to an address that functions in C find there."""
-        for handle, opened in self._open.items():
-            if opened is card:
-                ctypes.c_int64.from_address(handle).value = address
-
     # The functions, by their names in small letters, with the arguments of their signatures.
 
     def _hopen(self, name: bytes | None) -> int | None:
@@ -156,7 +145,7 @@ class Library:
         self._open[address] = card
         return address
 
-    def _why_not(self, name: str, card: Card | None) -> str:
+    def _why_not(self, name: str, card: SimulatedCard | None) -> str:
         if card is not None:
             return f"{name!r} is in use"
         if name.startswith(PREFIX) or self.has_vendor:
@@ -178,16 +167,10 @@ class Library:
     def _dwsetparam_i64m(self, handle: int | None, register: int, high: int, low: int) -> int:
         return self._write(handle, register, high << 32 | low)
 
-    def _dwsetparam_ptr(self, handle: int | None, register: int, address: int, n_bytes: int) -> int:
+    def _dwsetparam_ptr(self, handle: int | None, register: int, _address: int, _n: int) -> int:
         if register == r.SPC_WRITE_TO_LOG:
             return r.ERR_OK
-        card = self._open.get(handle or 0)
-        if card is None:
-            return r.ERR_INVALIDHANDLE
-        if register != r.SPC_REGISTER_LIST:
-            return r.ERR_REG
-        raw = (ctypes.c_char * n_bytes).from_address(address)
-        return card.write_all(list_writes(np.frombuffer(memoryview(raw), LIST_PARAM)))
+        return r.ERR_REG if handle in self._open else r.ERR_INVALIDHANDLE
 
     def _read(self, handle: int | None, register: int) -> tuple[int, Number]:
         card = self._open.get(handle or 0)
@@ -272,15 +255,15 @@ PREFIX: Final = "simulated"
 
 _LOCK: Final = threading.Lock()
 _LIBRARIES: Final[list[Library]] = []
-"""The library of this process, once there is one: ``spcm`` keeps it until the process ends."""
+"""The library of this process, once there is one: ``spcm_core`` keeps it until the process ends."""
 
 
 class SimulatedLibrary:
-    """What the driver of the AWG opens instead of the vendor's library: ``spcm`` with a simulated card.
+    """What the driver of the AWG opens instead of the vendor's library: ``spcm_core`` with a simulated card.
 
     Args:
-        name: "simulated" for a new card at each ``connect``; "simulated@" and a path for one in a process of
-            its own; another name for a card that :func:`install` made available.
+        name: "simulated" for a new card at each ``connect``; another name for one that
+            :func:`install` made available.
         clock: The session's time.
         simulation: Receives what the card plays, if it implements ``ReceivesOutput``.
         row_channel: Channel that drives the row axis; the other drives the columns.
@@ -294,14 +277,13 @@ class SimulatedLibrary:
         self._clock = clock
         self._simulation = simulation
         self._row_channel = row_channel
-        self._shared: SharedCard | None = None
         self.card: SimulatedCard | None = None
 
     def load(self) -> Any:
-        """Import ``spcm`` so that it finds simulated cards."""
+        """Import ``spcm_core`` so that it finds simulated cards."""
         with _LOCK:
             _library()
-        return importlib.import_module("spcm")
+        return importlib.import_module("spcm_core")
 
     def warm(self) -> None:
         """Compile the kernels with which the simulation evaluates the outputs."""
@@ -310,58 +292,46 @@ class SimulatedLibrary:
 
     def connect(self) -> str:
         """Make the card available; returns its device name."""
-        if self._name.startswith(SHARED):
-            self._shared = card = SharedCard(self._name.removeprefix(SHARED))
-            name = self._name
-        elif self._name == PREFIX:
-            received = isinstance(self._simulation, ReceivesOutput)
-            self.card = card = SimulatedCard(self._clock, keep_history=received)
-            name = ""
-        else:
+        if self._name != PREFIX:
             return self._name
+        received = isinstance(self._simulation, ReceivesOutput)
+        self.card = card = SimulatedCard(self._clock, keep_history=received)
+        self.wire(card)
+        return install(card)
+
+    def wire(self, card: SimulatedCard) -> None:
+        """Connect a card's trigger input to the simulation, and its outputs if that looks at them."""
         if self._simulation is not None:
             self._simulation.wire("mobile_tweezers", lambda t_s, _width_s: card.trigger_at(t_s))
         if isinstance(self._simulation, ReceivesOutput):
             self._simulation.connect_outputs("mobile_tweezers", CardOutputs(card, self._row_channel))
-        return install(card, name)
 
     def disconnect(self) -> None:
-        """Remove the card; one in a process of its own goes on."""
-        for mine in (self.card, self._shared):
-            for library in _LIBRARIES:
-                library.cards = {name: card for name, card in library.cards.items() if card is not mine}
-        if self._shared is not None:
-            self._shared.disconnect()
-        self.card = self._shared = None
+        """Remove the card."""
+        for library in _LIBRARIES:
+            library.cards = {name: card for name, card in library.cards.items() if card is not self.card}
+        self.card = None
 
     def functions(self) -> tuple[int, int]:
-        """Addresses of the C functions that read and that write a register of 64 bits.
-
-        In real time those of a card in this process need Python for other registers than a stream's only.
-        """
-        library, card = _library(), self.card or _library().cards.get(self._name)
-        names = "spcm_dwGetParam_i64", "spcm_dwSetParam_i64"
-        read, write = (ctypes.cast(library.functions[name], ctypes.c_void_p).value or 0 for name in names)
-        if self._clock.virtual or not isinstance(card, SimulatedCard):
-            return read, write
-        library.point_handle_to(card, card.direct_words(read, write))
-        return c_address(read_register), c_address(write_register)
+        """Addresses of the C functions that read and that write a register of 64 bits."""
+        functions = _library().functions
+        read, write = (
+            ctypes.cast(functions[name], ctypes.c_void_p).value or 0
+            for name in ("spcm_dwGetParam_i64", "spcm_dwSetParam_i64")
+        )
+        return read, write
 
     def call_in_virtual_time(self, step: Callable[[], float | None] | None) -> bool:
         """Have the card call a driver's step whenever it is due; False if time is real."""
         card = self.card or _library().cards.get(self._name)
-        if not self._clock.virtual or not isinstance(card, SimulatedCard):
+        if not self._clock.virtual or card is None:
             return False
         card.call(step)
         return True
 
-    def emergency(self, script: Path, arguments: Mapping[str, Any]) -> Emergency | None:
-        """The driver's script, for a card in a process of its own; one in this process dies with it."""
-        if not self._name.startswith(SHARED):
-            return None
-        path = str(Path(self._name.removeprefix(SHARED)).absolute())
-        own = {"script": str(script), "library": "of the simulator", "card": path}
-        return Emergency(Path(__file__).with_name("emergency.py"), {**arguments, **own})
+    def emergency(self, script: Path) -> Emergency | None:  # noqa: ARG002 - for a real card
+        """None: the card is in this process, and dies with it."""
+        return None
 
 
 class CardOutputs:
@@ -374,7 +344,7 @@ class CardOutputs:
         row_channel: Channel that drives the row axis; the other drives the columns.
     """
 
-    def __init__(self, card: Card, row_channel: int) -> None:
+    def __init__(self, card: SimulatedCard, row_channel: int) -> None:
         self._card = card
         self._channels = row_channel, 1 - row_channel
         self._reported_s = -math.inf
@@ -395,22 +365,10 @@ class CardOutputs:
         return [_rf_span(part, span) for span, part in spans if part.end_s > part.start_s]
 
 
-def _rf_span(span: Span, whole: Span) -> RfSpan:
-    if isinstance(span, SampleSpan):
-        if isinstance(whole, SampleSpan) and whole.n_samples > len(whole.samples):
-            return _loop_tones(span)
-        return RfSamples(span.start_s, span.sample_rate_hz, span.values(), span.amplitude_v / FULL_SCALE)
-    values = [
-        (
-            tone.frequency_hz,
-            tone.frequency_slope,
-            tone.amplitude * span.amplitude_v,
-            tone.amplitude_slope * span.amplitude_v,
-            tone.phase_rad - math.pi / 2,  # the card's tones are sines
-        )
-        for tone in span.tones
-    ]
-    return RfTones(span.start_s, span.end_s, *np.array(values, np.float64).reshape(-1, 5).T)
+def _rf_span(span: SampleSpan, whole: SampleSpan) -> RfSpan:
+    if whole.n_samples > len(whole.samples):
+        return _loop_tones(span)
+    return RfSamples(span.start_s, span.sample_rate_hz, span.values(), span.amplitude_v / FULL_SCALE)
 
 
 def _loop_tones(span: SampleSpan) -> RfTones:
@@ -423,8 +381,8 @@ def _loop_tones(span: SampleSpan) -> RfTones:
     return RfTones(span.start_s, span.end_s, hz, zeros, volts, zeros, np.angle(found))
 
 
-def install(card: Card, name: str = "") -> str:
-    """Make a simulated card available to ``spcm`` under a device name.
+def install(card: SimulatedCard, name: str = "") -> str:
+    """Make a simulated card available under a device name.
 
     Args:
         card: The card.
@@ -450,8 +408,8 @@ def install(card: Card, name: str = "") -> str:
 
 
 @contextmanager
-def installed(card: Card, name: str = "") -> Generator[str]:
-    """Within the block the card is available to ``spcm``; gives its device name."""
+def installed(card: SimulatedCard, name: str = "") -> Generator[str]:
+    """Within the block the card is available; gives its device name."""
     name = install(card, name)
     try:
         yield name
@@ -480,13 +438,13 @@ def _vendor() -> Any:
 
 
 def _library() -> Library:
-    """The library of this process; the first call imports ``spcm``, also where it was imported before."""
+    """The library of this process; the first call imports ``spcm_core``, even if it was imported before."""
     if not _LIBRARIES:
         library = Library(_vendor())
         for name in [name for name in sys.modules if name.partition(".")[0] in ("spcm", "spcm_core")]:
             del sys.modules[name]  # an importer of the old one keeps the vendor's functions
         with _answered(library):
-            importlib.import_module("spcm")
+            importlib.import_module("spcm_core")
         _LIBRARIES.append(library)
     return _LIBRARIES[0]
 

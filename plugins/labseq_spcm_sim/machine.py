@@ -6,17 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
-from labseq_spcm_sim import fifo_kernels as k, registers as r
-from labseq_spcm_sim.dds import CoreOutputs, Dds
+from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.modes import Buffer, Fifo, Memory, Replay, Run, Stretch
-from labseq_spcm_sim.output import Amplifier, SampleSpan, Span
+from labseq_spcm_sim.output import Amplifier, SampleSpan
 from labseq_spcm_sim.setup import UNKNOWN, CardModel, Number, Refusal, Setup, refuse, trigger_delay_s
 
 AMPLITUDES: Final = {r.SPC_AMP0: 0, r.SPC_AMP1: 1}
 OUTPUTS: Final = {r.SPC_ENABLEOUT0: 0, r.SPC_ENABLEOUT1: 1}
-DDS_REGISTERS: Final = range(r.SPC_DDS_CORE0_FREQ, r.SPC_DDS_AVAIL_PHASE_STEP + 1)
 WAITS: Final = r.M2CMD_CARD_WAITTRIGGER | r.M2CMD_CARD_WAITREADY | r.M2CMD_DATA_WAITDMA
 
 
@@ -45,15 +41,14 @@ class Machine:
 
     Args:
         model: What card it is.
+        keeps_streams: Whether samples of streams are kept, not only those of replays.
     """
 
-    def __init__(self, model: CardModel) -> None:
+    def __init__(self, model: CardModel, *, keeps_streams: bool) -> None:
         self.model = model
+        self._keeps_streams = keeps_streams
         self.amplifiers = (Amplifier(model), Amplifier(model))
-        self.dds = Dds(model.n_dds_cores, model.dds_queue)
-        self.words = np.zeros(k.N_WORDS, np.int64)
         self.samples: list[Record] = []
-        self.tones: list[CoreOutputs] = []
         self._power_on()
 
     def _power_on(self) -> None:
@@ -75,7 +70,6 @@ class Machine:
             if self.run is not None:
                 self.run.advance(done_s)
             self.memory.store(data)
-        self.dds.advance(now_s)
         if self.fifo is not None:
             self.fifo.advance(now_s)
         if self.run is not None:
@@ -86,7 +80,6 @@ class Machine:
 
     def _end_run(self, now_s: float) -> None:
         self.samples += self._run_samples(now_s)
-        self.tones += self.dds.stop(now_s)
         self.free_bytes = self.fifo.user_bytes if self.fifo else 0
         self.run = self.fifo = None
         self.running = self.trigger_enabled = False
@@ -95,23 +88,18 @@ class Machine:
         stretches = self.run.played(now_s) if self.run is not None else []
         return [Record(stretch, self.setup.channels, self.setup[r.SPC_SAMPLERATE]) for stretch in stretches]
 
-    def played(self, channel: int, now_s: float) -> list[Span]:
+    def played(self, channel: int, now_s: float) -> list[SampleSpan]:
         """What reached the connector of a channel up to now, in time's order."""
         amplifier = self.amplifiers[channel]
-        parts: list[Span] = []
+        parts: list[SampleSpan] = []
         for record in self.samples + self._run_samples(now_s):
             if channel in record.channels:
                 parts += amplifier.cut(record.span(channel))
-        for outputs in self.tones + self.dds.played(now_s):
-            for span in outputs.spans(channel):
-                parts += amplifier.cut(span)
         return sorted(parts, key=lambda part: part.start_s)
 
     def forget(self, before_s: float) -> None:
         """Drop what was played before a time."""
         self.samples = [record for record in self.samples if record.span(record.channels[0]).end_s > before_s]
-        self.tones = [outputs for outputs in self.tones if outputs.end_s > before_s]
-        self.dds.forget(before_s)
         if self.fifo is not None:
             self.fifo.forget(before_s)
         for amplifier in self.amplifiers:
@@ -123,9 +111,6 @@ class Machine:
         """Write a register, also a command."""
         if register == r.SPC_M2CMD:
             self._command(int(value), now_s)
-        elif register in DDS_REGISTERS:
-            if self.setup.on_card(r.SPC_CARDMODE) == r.SPC_REP_STD_DDS:  # else it is lost
-                self.dds.write(register, value, now_s)
         elif register == r.SPC_DATA_AVAIL_CARD_LEN:
             if self.fifo is None:
                 raise Refusal(r.ERR_SEQUENCE, "no FIFO buffer is defined")
@@ -137,8 +122,6 @@ class Machine:
 
     def read(self, register: int) -> Number:
         """Read a register."""
-        if register in DDS_REGISTERS:
-            return self.dds.read(register)
         if register == r.SPC_M2STATUS:
             return self._status()
         if register == r.SPC_CHCOUNT:
@@ -200,7 +183,6 @@ class Machine:
         """Everything as after power-on, outputs off."""
         if self.running:
             self._end_run(now_s)
-        self.dds.reset(now_s)
         for amplifier in self.amplifiers:
             amplifier.enable(on=False, now_s=now_s)
             amplifier.set_amplitude(1000, now_s)
@@ -211,9 +193,7 @@ class Machine:
             raise Refusal(r.ERR_SEQUENCE, "the card runs already")
         setup = self.setup
         n_samples, n_channels, loops = setup[r.SPC_MEMSIZE], len(setup.channels), setup[r.SPC_LOOPS]
-        if setup.mode == r.SPC_REP_STD_DDS:
-            self.dds.start()
-        elif setup.mode == r.SPC_REP_STD_SINGLE:
+        if setup.mode == r.SPC_REP_STD_SINGLE:
             memory = self.memory
             self.run = Replay(lambda: memory.read(n_samples, n_channels), setup[r.SPC_SAMPLERATE], loops)
         elif self.fifo is None:
@@ -226,12 +206,8 @@ class Machine:
 
     def _fire(self, now_s: float) -> None:
         """A trigger from any source."""
-        if not self.running:
-            return
-        self.triggered = True
-        if self.run is None:
-            self.dds.trigger(now_s)
-        else:
+        if self.run is not None:
+            self.triggered = True
             self.run.trigger(now_s + trigger_delay_s(self.setup[r.SPC_SAMPLERATE]))
 
     def pulse(self, voltage_v: float, now_s: float) -> bool:
@@ -258,9 +234,10 @@ class Machine:
         if setup.mode == r.SPC_REP_FIFO_SINGLE:
             if self.running:
                 raise Refusal(r.ERR_RUNNING, "card is still running, access not possible")
+            self.memory = Memory(self.model.bus_bytes_per_s)  # the FIFO takes its place
             rate_hz, room_bytes = setup[r.SPC_SAMPLERATE], setup.on_card(r.SPC_DATA_OUTBUFSIZE)
             bus = self.model.bus_bytes_per_s
-            self.fifo = Fifo(self.words, buffer, setup.frame_bytes, rate_hz, room_bytes, bus)
+            self.fifo = Fifo(buffer, setup.frame_bytes, rate_hz, room_bytes, bus, keeps=self._keeps_streams)
         elif buffer.n_bytes > (room := setup[r.SPC_MEMSIZE] * setup.frame_bytes):
             raise refuse(buffer.n_bytes, f"at most {room} bytes; set the memory size first")
         self.buffer = buffer

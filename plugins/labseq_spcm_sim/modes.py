@@ -7,13 +7,12 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq_spcm_sim import fifo_kernels as k, registers as r
+from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.output import ROUNDING
 from labseq_spcm_sim.setup import OUTPUT_FIFO_BYTES, Refusal, refuse
 
@@ -185,78 +184,60 @@ class Replay:
         return cut(self._stretches, self._rate, now_s)
 
 
-def runs(blocks: Samples) -> list[tuple[int, int]]:
-    """Cut blocks, int16 (n, samples), into runs of equal ones and runs in which neighbours differ."""
-    same = np.zeros(len(blocks) + 1, np.bool_)
-    same[1:-1] = (blocks[1:, :8] == blocks[:-1, :8]).all(axis=1)  # most that are not differ at once
-    for at in same.nonzero()[0]:
-        same[at] = np.array_equal(blocks[at], blocks[at - 1])
-    alone = ~same[:-1] & ~same[1:]
-    cuts = ~same[1:-1] & ~(alone[1:] & alone[:-1])
-    edges = [0, *(cuts.nonzero()[0] + 1).tolist(), len(blocks)]
-    return [*pairwise(edges)]
+ROUNDING_BYTES: Final = 1e-3
+"""Bytes that are a rounding error of time."""
 
 
 class Fifo:
-    """A ring buffer in the PC, the bus, the on-board memory as a FIFO, and the output.
+    """FIFO_SINGLE: a ring buffer in the PC, the bus, the on-board memory as a FIFO, and the output.
 
-    Bytes are handed over by the user, transferred by the bus while there is room on the
-    card, and consumed by the output from the trigger on. Until they are transferred the user
-    may change them. When the output finds none it stops: an underrun.
+    Bytes are handed over by the user, fetched by the bus while there is room on the card, and played from
+    the trigger on. The bus reads a whole block when it fetches the first byte of it: until then the user may
+    change it. When the output finds none it stops: an underrun.
 
     Args:
-        words: Where its state is, for code in C; see ``fifo_kernels``.
         buffer: The ring.
         frame_bytes: Bytes of one sample of all active channels.
         sample_rate_hz: Sample rate.
         room_bytes: How much of the on-board memory is used.
         bus_bytes_per_s: Speed of the bus.
+        keeps: Whether what is played is kept for :meth:`played`.
+
+    Attributes:
+        handed: Bytes handed over so far.
+        fetched: Those that the bus has fetched.
+        n_played: Those that the output has played.
+        total: Those to play until the end; inf until the stop.
+        play_s: When the output starts; inf if that is not known.
+        is_transferring: Whether the bus fetches what is handed over.
+        finished: Whether everything was played.
+        failed: Whether the output found no data.
     """
 
     def __init__(
         self,
-        words: NDArray[np.int64],
         buffer: Buffer,
         frame_bytes: int,
         sample_rate_hz: float,
-        room_bytes: int,
+        room_bytes: float,
         bus_bytes_per_s: float,
+        *,
+        keeps: bool = True,
     ) -> None:
-        self._buffer = buffer
-        self._frame = frame_bytes
-        self._rate = sample_rate_hz
+        self._buffer, self._frame, self._rate, self._keeps = buffer, frame_bytes, sample_rate_hz, keeps
+        self._room, self._bus = room_bytes, bus_bytes_per_s
         self._pieces: list[tuple[int, Stretch]] = []
-        self._words, self._real = words, words.view(np.float64)
-        words[k.ADDRESS], words[k.N_BYTES], words[k.NOTIFY] = (
-            buffer.address,
-            buffer.n_bytes,
-            buffer.notify_bytes,
-        )
-        words[k.FRAME] = frame_bytes
-        words[k.HANDED] = words[k.DMA] = words[k.FAILED] = words[k.FINISHED] = 0
-        words[k.N_ENTRIES] = words[k.N_READ] = words[k.HAS_LEFT_OUT] = words[k.LATCHED] = 0
-        self._real[k.RATE : k.NOW] = sample_rate_hz, room_bytes, bus_bytes_per_s, math.inf, 0.0, 0.0
-        self._real[k.NOW], self._real[k.PLAY] = -math.inf, math.inf
-
-    @property
-    def failed(self) -> bool:
-        """Whether the output found no data."""
-        return bool(self._words[k.FAILED])
-
-    @property
-    def finished(self) -> bool:
-        """Whether everything was played."""
-        return bool(self._words[k.FINISHED])
-
-    @property
-    def play_s(self) -> float:
-        """When the output starts; inf if that is not known."""
-        return float(self._real[k.PLAY])
+        self._latched = 0
+        self._now_s = -math.inf
+        self.handed = 0
+        self.fetched = self.n_played = 0.0
+        self.total = self.play_s = math.inf
+        self.is_transferring = self.finished = self.failed = False
 
     def set_length(self, n_samples: int) -> None:
         """The card is started, with the number of samples per channel to play; 0: until the stop."""
-        self._real[k.TOTAL] = n_samples * self._frame if n_samples else math.inf
-        self._real[k.ROOM] += OUTPUT_FIFO_BYTES
+        self.total = n_samples * self._frame if n_samples else math.inf
+        self._room += OUTPUT_FIFO_BYTES
 
     def hand_over(self, n_bytes: int) -> None:
         """The user has filled bytes, which the card may now fetch."""
@@ -264,100 +245,98 @@ class Fifo:
             raise refuse(n_bytes, f"0 to {self.user_bytes} bytes")
         if n_bytes % self._frame:
             raise refuse(n_bytes, f"a multiple of {self._frame} bytes")
-        self._words[k.HANDED] += n_bytes
-
-    def _take_kept(self) -> None:
-        """Take over what was fetched beside Python.
-
-        Raises:
-            RuntimeError: The memory for it was full.
-        """
-        words, entry, data = self._words, np.zeros(4, np.int64), np.empty(0, np.uint8)
-        while k.take(words, entry, data) or entry[3]:
-            if entry[3] > len(data):
-                data = np.empty(entry[3], np.uint8)
-                continue
-            self._keep(int(entry[0]), int(entry[1]), data[: entry[3]].view(np.int16))
-        if words[k.HAS_LEFT_OUT]:
-            raise RuntimeError("the simulated card has not kept all that it played; read it more often")
-
-    def _keep(self, start: int, n_bytes: int, data: Samples) -> None:
-        """Remember samples that will be played, no silence, and of equal blocks only the first.
-
-        Args:
-            start: Their place in the stream, in bytes.
-            n_bytes: How many are played; ``data`` is repeated.
-            data: Samples.
-        """
-        size = self._buffer.notify_bytes
-        if size and n_bytes == data.nbytes and not n_bytes % size:
-            blocks = data.reshape(-1, size // 2)
-            for first, end in runs(blocks):
-                is_one = end - first > 1 and np.array_equal(blocks[first], blocks[first + 1])
-                part = blocks[first : first + 1 if is_one else end]
-                self._keep_piece(start + first * size, (end - first) * size, part)
-        else:
-            self._keep_piece(start, n_bytes, data)
-
-    def _keep_piece(self, start: int, n_bytes: int, data: Samples) -> None:
-        """The same for equal blocks, or for blocks of which each differs from the one before."""
-        words = data.view(np.uint64) if data.nbytes % 8 == 0 else data.view(np.uint16)
-        if not words.max():  # several times faster than any()
-            return
-        data = data.reshape(-1, self._frame // 2)
-        first, n_samples = start // self._frame, n_bytes // self._frame
-        if n_bytes > data.nbytes and self._pieces:
-            before, last = self._pieces[-1]
-            if before + last.n_samples == first and np.array_equal(last.samples, data):
-                self._pieces[-1] = before, replace(last, n_samples=last.n_samples + n_samples)
-                return
-        self._pieces.append((first, Stretch(0.0, data.copy(), n_samples)))
+        self.handed += n_bytes
 
     def switch_dma(self, on: bool, now_s: float) -> None:
         """Whether the bus fetches what was handed over."""
         self.advance(now_s)
-        self._words[k.DMA] = on
+        self.is_transferring = on
 
-    @property
-    def is_transferring(self) -> bool:
-        """Whether the bus fetches what is handed over."""
-        return bool(self._words[k.DMA])
+    def trigger(self, out_s: float) -> None:
+        """The first trigger starts the output."""
+        self.play_s = min(self.play_s, out_s)
 
     @property
     def user_bytes(self) -> int:
         """Bytes that are free for the user, in whole notify sizes."""
-        return int(k.user_bytes(self._words))
+        fetched = math.floor(self.fetched + ROUNDING_BYTES)
+        notified = fetched - fetched % max(1, self._buffer.notify_bytes)
+        return self._buffer.n_bytes - (self.handed - notified)
 
     @property
     def levels(self) -> tuple[float, float]:
         """Bytes that were handed over and wait in the computer, and that wait on the card."""
-        fetched = float(self._real[k.FETCHED])
-        return float(self._words[k.HANDED]) - fetched, fetched - float(self._real[k.PLAYED])
+        return self.handed - self.fetched, self.fetched - self.n_played
 
     @property
     def block_ready(self) -> bool:
         """Whether there is room for a block, or all was transferred."""
-        is_idle = self._real[k.FETCHED] >= self._words[k.HANDED]
-        return self.user_bytes >= max(1, self._buffer.notify_bytes) or bool(is_idle)
+        return self.user_bytes >= max(1, self._buffer.notify_bytes) or self.fetched >= self.handed
 
     def advance(self, now_s: float) -> None:
-        """Let bytes flow up to now; of those that are fetched, only now the content is decided."""
-        n_bytes = int(k.advance(self._words, now_s))
-        if n_bytes > 0:
-            start = int(self._words[k.LATCHED])
-            self._keep(start, n_bytes, self._buffer.fetch(start, n_bytes))
-            self._words[k.LATCHED] = start + n_bytes
+        """Let bytes flow up to now."""
+        if self._now_s == -math.inf:
+            self._now_s = now_s
+        while self._now_s < now_s and not self.failed and not self.finished:
+            self._flow(now_s)
+        self._now_s = max(self._now_s, now_s)
+        self._latch()
 
-    def trigger(self, out_s: float) -> None:
-        """The first trigger starts the output."""
-        self._real[k.PLAY] = min(self._real[k.PLAY], out_s)
+    def _flow(self, now_s: float) -> None:
+        """Let bytes flow until something changes: the start, the end of the data, full, empty, or now."""
+        drain = self._rate * self._frame if self._now_s >= self.play_s else 0.0
+        waiting, fill = self.levels
+        speed = 0.0
+        if self.is_transferring and waiting > ROUNDING_BYTES:
+            speed = self._bus if fill < self._room - ROUNDING_BYTES else min(self._bus, drain)
+        if drain > speed and fill <= ROUNDING_BYTES:
+            self.failed = True
+            return
+        step_s, end_s = now_s - self._now_s, now_s
+        for span, per_s in (
+            (self.play_s - self._now_s, 1.0 if self._now_s < self.play_s else 0.0),
+            (waiting, speed),
+            (self._room - fill, speed - drain),
+            (fill, drain - speed),
+            (self.total - self.n_played, drain),
+        ):
+            if per_s > 0.0 and span / per_s < step_s:
+                step_s = span / per_s
+                end_s = max(self._now_s + step_s, math.nextafter(self._now_s, math.inf))
+        self._now_s = end_s
+        self.fetched = min(float(self.handed), self.fetched + speed * step_s)
+        self.n_played = min(self.fetched, self.n_played + drain * step_s)
+        self.finished = self.n_played >= self.total - ROUNDING_BYTES
+
+    def _latch(self) -> None:
+        """Keep the blocks that the bus has begun to fetch: what the user writes there now comes too late."""
+        block = self._buffer.notify_bytes or self._frame
+        begun = min(math.ceil((self.fetched - ROUNDING_BYTES) / block) * block, self.handed)
+        start, self._latched = self._latched, max(self._latched, begun)
+        if self._keeps and begun > start:
+            step = self._buffer.notify_bytes or begun - start
+            for at in range(start, begun, step):
+                self._keep(at, self._buffer.fetch(at, min(step, begun - at)))
+
+    def _keep(self, start: int, data: Samples) -> None:
+        """Keep samples from a place in the stream, in bytes; no silence, and of equal blocks only one."""
+        words = data.view(np.uint64) if data.nbytes % 8 == 0 else data.view(np.uint16)
+        if not words.max():  # several times faster than any()
+            return
+        data = data.reshape(-1, self._frame // 2)
+        first = start // self._frame
+        if self._pieces:
+            before, last = self._pieces[-1]
+            if before + last.n_samples == first and np.array_equal(last.samples, data):
+                self._pieces[-1] = before, replace(last, n_samples=last.n_samples + len(data))
+                return
+        self._pieces.append((first, Stretch(0.0, data.copy(), len(data))))
 
     def played(self, now_s: float) -> list[Stretch]:
         """The samples that were output so far."""
-        self._take_kept()
-        n_samples, play_s = math.floor((self._real[k.PLAYED] + k.SMALL) / self._frame), self.play_s
+        n_samples = math.floor((self.n_played + ROUNDING_BYTES) / self._frame)
         stretches = [
-            Stretch(play_s + first / self._rate, piece.samples, min(piece.n_samples, n_samples - first))
+            Stretch(self.play_s + first / self._rate, piece.samples, min(piece.n_samples, n_samples - first))
             for first, piece in self._pieces
             if first < n_samples
         ]
@@ -365,7 +344,6 @@ class Fifo:
 
     def forget(self, before_s: float) -> None:
         """Drop the data that were played before a time."""
-        self._take_kept()
         if self.play_s < before_s:
             n_samples = (before_s - self.play_s) * self._rate
             self._pieces = [piece for piece in self._pieces if piece[0] + piece[1].n_samples > n_samples]

@@ -1,10 +1,9 @@
-"""The output of the card: spans of samples or of DDS tones, and the amplifier."""
+"""The output of the card: spans of samples, and the amplifier."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,67 +63,6 @@ class SampleSpan:
         return math.ceil(min(max(samples - ROUNDING, 0), self.n_samples))
 
 
-@dataclass(frozen=True, slots=True)
-class Tone:
-    """The output of one DDS core from a certain time on.
-
-    Attributes:
-        core: Index of the core.
-        frequency_hz: Frequency at that moment.
-        frequency_slope: Its change in Hz/s.
-        amplitude: Amplitude at that moment, -1 to 1 of full scale.
-        amplitude_slope: Its change in 1/s.
-        phase_rad: Phase at that moment; the tone is amplitude * sin(phase).
-    """
-
-    core: int
-    frequency_hz: float = 0.0
-    frequency_slope: float = 0.0
-    amplitude: float = 0.0
-    amplitude_slope: float = 0.0
-    phase_rad: float = 0.0
-
-    def after(self, duration_s: float) -> Tone:
-        """The tone some time later."""
-        turns = (self.frequency_hz + 0.5 * self.frequency_slope * duration_s) * duration_s
-        return replace(
-            self,
-            frequency_hz=self.frequency_hz + self.frequency_slope * duration_s,
-            amplitude=min(1.0, max(-1.0, self.amplitude + self.amplitude_slope * duration_s)),
-            phase_rad=math.remainder(self.phase_rad + math.tau * math.remainder(turns, 1.0), math.tau),
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class ToneSpan:
-    """DDS tones that one channel played between two of its events.
-
-    Attributes:
-        start_s: When they were first at the output, on the session's clock.
-        end_s: When the next event changed them.
-        amplitude_v: Voltage into 50 Ohm of full scale.
-        tones: The tones as they were at ``start_s``; silent cores are left out.
-    """
-
-    start_s: float
-    end_s: float
-    amplitude_v: float
-    tones: tuple[Tone, ...]
-
-    def between(self, start_s: float, end_s: float) -> ToneSpan:
-        """The part of the span within a time."""
-        later_s, end_s = max(0.0, start_s - self.start_s), min(end_s, self.end_s)
-        start_s = max(start_s, self.start_s)
-        tones = tuple(tone.after(later_s) for tone in self.tones) if later_s else self.tones
-        return replace(self, start_s=start_s, end_s=max(start_s, end_s), tones=tones)
-
-
-Span = SampleSpan | ToneSpan
-
-
-S = TypeVar("S", SampleSpan, ToneSpan)
-
-
 @dataclass(slots=True)
 class Amplifier:
     """The output stage of one channel: on or off, amplitude, the relay between its two paths.
@@ -169,10 +107,10 @@ class Amplifier:
         else:
             self.changes.append((now_s, volts))
 
-    def cut(self, span: S) -> list[S]:
+    def cut(self, span: SampleSpan) -> list[SampleSpan]:
         """The parts of a span that reached the connector, with their voltages."""
         ends = [*(start_s for start_s, _ in self.changes[1:]), math.inf]
-        parts: list[S] = []
+        parts: list[SampleSpan] = []
         for (start_s, volts), end_s in zip(self.changes, ends, strict=True):
             if volts and start_s < span.end_s and end_s > span.start_s:
                 parts.append(replace(span.between(start_s, end_s), amplitude_v=volts))

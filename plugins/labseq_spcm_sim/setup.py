@@ -1,7 +1,7 @@
 """What the card can do, and which values its registers take.
 
 Source, where no other is named: Spectrum's manual "M4i.66xx/M4i.96xx", chapters on analog
-outputs, generation modes, trigger, sequence mode and DDS20; for the DDS steps and for
+outputs, generation modes and trigger; for
 behaviour that the manual does not describe, what ColdMatter (EDMSuite, ``HANDOFF.md``) measured
 on an M4i.9622-x8.
 
@@ -35,10 +35,8 @@ class CardModel:
         relay_s: How long the output is off when the path changes.
         output_relay_s: How long an output is off after its relay was closed (ours, as the path's relay).
         bus_bytes_per_s: Transfer from the PC; PCIe x8 Gen 2.
-        n_dds_cores: DDS cores on the chip; that a 6631 has 23 is not measured.
         temperature_c: What its sensors read, in degrees Celsius (ours).
         firmware_type: 1 for its own, 2 for the recovery firmware.
-        dds_queue: Commands that the DDS queue holds (an M4i.9622 reads 4098).
     """
 
     name: str = "M4i.6631-x8"
@@ -52,10 +50,8 @@ class CardModel:
     relay_s: float = 10e-3
     output_relay_s: float = 10e-3
     bus_bytes_per_s: float = 2.8e9
-    n_dds_cores: int = 23
     temperature_c: int = 45
     firmware_type: int = 1
-    dds_queue: int = 4096
 
 
 M4I6631: Final = CardModel()
@@ -68,35 +64,10 @@ MEMORY_STEP: Final = 32
 """Step and minimum of the memory size, in samples per channel."""
 MAX_LOOPS: Final = 2**32 - 1
 
-FAST_CLOCK_HZ: Final = 625e6
-"""Above this sample rate the trigger's way to the output takes twice as many clocks."""
-
 
 def trigger_delay_s(sample_rate_hz: float) -> float:
     """From the trigger to the first sample: 476.5 clocks above 625 MS/s, else 238.5, and 16 ns."""
-    clocks = 476.5 if sample_rate_hz > FAST_CLOCK_HZ else 238.5
-    return clocks / sample_rate_hz + 16e-9
-
-
-DDS_RATE_HZ: Final = 1.25e9
-"""The DDS runs at the full sample rate."""
-DDS_TIMER_STEP_S: Final = 6.4e-9
-DDS_TIMER_S: Final = (83.2e-9, 27.487790730)
-DDS_FREQUENCY_STEP_HZ: Final = DDS_RATE_HZ / 2**32
-DDS_AMPLITUDE_STEP: Final = 1 / 32767
-DDS_PHASE_STEP_DEG: Final = 360 / 4096
-DDS_FREQUENCY_SLOPE_STEP: Final = 2775.5575615628914
-"""In Hz/s, with a ramp step size of 1."""
-DDS_FREQUENCY_SLOPE_MAX: Final = 1.90734863280903e14
-DDS_AMPLITUDE_SLOPE_STEP: Final = 298.03231910153505
-"""In 1/s, with a ramp step size of 1."""
-DDS_AMPLITUDE_SLOPE_MAX: Final = 305174.6170612535
-DDS_TRIGGER_DELAY_S: Final = 560e-9
-"""From a trigger to the change of the output."""
-DDS_COMMANDS_PER_S: Final = 10e6
-"""Commands per second that reach the card by DMA, in the background."""
-DDS_LATENCY_S: Final = 20e-6
-"""Latency of a block by DMA."""
+    return (476.5 if sample_rate_hz > 625e6 else 238.5) / sample_rate_hz + 16e-9
 
 
 Number = int | float
@@ -274,7 +245,7 @@ _SWITCH: Final = one_of(0, 1)
 _STOP_LEVEL: Final = one_of(
     r.SPCM_STOPLVL_ZERO, r.SPCM_STOPLVL_LOW, r.SPCM_STOPLVL_HIGH, r.SPCM_STOPLVL_HOLDLAST
 )
-_MODES: Final = (r.SPC_REP_STD_SINGLE, r.SPC_REP_FIFO_SINGLE, r.SPC_REP_STD_DDS)
+_MODES: Final = (r.SPC_REP_STD_SINGLE, r.SPC_REP_FIFO_SINGLE)
 
 _SETTINGS: Final[dict[int, tuple[Rule, Number]]] = {
     r.SPC_TIMEOUT: (within(0, 2**31 - 1), 0),
@@ -314,7 +285,7 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_FNCTYPE: r.SPCM_TYPE_AO,
         r.SPC_PCIMEMSIZE: 2 * model.memory_samples,
         r.SPC_PCIFEATURES: 0,
-        r.SPC_PCIEXTFEATURES: r.SPCM_FEAT_EXTFW_DDS20 | r.SPCM_FEAT_EXTFW_AWG,
+        r.SPC_PCIEXTFEATURES: r.SPCM_FEAT_EXTFW_AWG,
         r.SPC_MIINST_MODULES: 1,
         r.SPC_MIINST_CHPERMODULE: 2,
         r.SPC_MIINST_BYTESPERSAMPLE: 2,

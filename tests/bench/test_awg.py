@@ -26,7 +26,6 @@ TRIGGER = "awg: {channel: 7, on: [rearrange], pulse: 0.1 ms, triggers: mobile_tw
 TIMING = f"{MOBILE}.overhead_per_cycle=13 ms"  # the same in every mode, so that the atoms wait equally long
 TRIGGERED = (TIMING, f"profile.lines={{use: virtual, channels: {{{TRIGGER}}}}}")
 STREAM = (TIMING, f"{MOBILE}.mode=stream")
-DDS = (*TRIGGERED, f"{MOBILE}.mode=dds", f"{MOBILE}.max_row_tones=16", f"{MOBILE}.max_column_tones=5")
 
 UNEVEN = tuple(
     f"profile.simulation.{value}"
@@ -67,11 +66,10 @@ def filled_once(shot: Shot, done: Run) -> float:
     return done.target.filling_fraction(shot.occupancies[first])
 
 
-@pytest.mark.parametrize("overrides", [TRIGGERED, STREAM, DDS], ids=["replay", "stream", "dds"])
+@pytest.mark.parametrize("overrides", [TRIGGERED, STREAM], ids=["replay", "stream"])
 def test_filling_agrees_with_the_virtual_profile(run: RunProfile, overrides: tuple[str, ...]) -> None:
     played = run("bench_awg", *overrides)
-    motion = [text for text in overrides if "max_" in text]
-    virtual = run("virtual", *motion, shots=5 * N_SHOTS)
+    virtual = run("virtual", shots=5 * N_SHOTS)
     assert virtual.shots[0].atom_events == {}
     found, expected = (np.array([filled_once(s, done) for s in done.shots]) for done in (played, virtual))
     error = float(expected.std()) * math.sqrt(1 / len(found) + 1 / len(expected))

@@ -2,10 +2,10 @@
 
     python -m tests.benchmarks.stream_load --programs 10000 --load 2 --rate 624e6 --picture light.png
 
-The simulated card plays in real time, in compiled code that needs no lock of Python: what the driver does not
-hand over in time is missing. From a frame in memory to the light it goes as in a run: detector, planner,
-check, tones of the first batches, ``prepare_beginning``, ``play``; then the rest. The light is when
-the card's clock reached the first sample of the program.
+The simulated card plays in real time, in compiled code that needs no lock of Python (``native_card.py``):
+what the driver does not hand over in time is missing. From a frame in memory to the light it goes as in a
+run: detector, planner, check, tones of the first batches, ``prepare_beginning``, ``play``; then the rest. The
+light is when the card's clock reached the first sample of the program.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import math
 import multiprocessing
 import os
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -46,6 +47,8 @@ from labseq.plugin import (
     TransientError,
 )
 from labseq.realtime import raise_priority, real_time, restore_priority
+
+from .native_card import native_stream
 
 Words = NDArray[np.int64]
 
@@ -156,7 +159,7 @@ def stream(given: argparse.Namespace) -> Counts:
     """Play programs one after another."""
     context = Context("mobile_tweezers", GRID, motion=MOTION)
     card, counts, frames = SimulatedCard(context.clock, keep_history=False), Counts(), take_frames()
-    with real_time(), installed(card) as name:
+    with ExitStack() as context_of_card, real_time(), installed(card) as name:
         settings = SpcmSettings(
             card=name,
             mode="stream",
@@ -166,6 +169,7 @@ def stream(given: argparse.Namespace) -> Counts:
             card_buffer=given.card_buffer,
         )
         tweezers = SpcmMobileTweezers(settings, context)
+        context_of_card.enter_context(native_stream(tweezers, name, context.clock))
         tweezers.warm()
         warm()
         warm_rendering()

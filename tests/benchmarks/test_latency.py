@@ -1,7 +1,7 @@
 """What passes between a frame in memory and the first samples, part by part, called directly.
 
-``labseq bench latency`` measures the same as a run calls it. The goals: 2 ms from the frame to
-the first chunk, and 5 ms from the plan to the first block of the DDS.
+``labseq bench latency`` measures the same as a run calls it. The goal: 2 ms from the frame to
+the first chunk.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_psca.planner import PscaPlanner, PscaSettings
-from labseq_spcm.dds import choose_cores, compile_commands
-from labseq_spcm.settings import SpcmSettings
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 
@@ -24,7 +22,6 @@ from labseq.plugin import Context, DepthRamp, Frame, MotionSpec, RandomStream, S
 CHUNK = 1 << 15  # samples per channel that a stream needs first
 GRID = SiteGrid()
 RATE_HZ = comb_sample_rate(GRID)
-DDS_LIMITS = MotionSpec(max_row_tones=16, max_column_tones=5)
 
 
 class Case:
@@ -95,11 +92,3 @@ def test_a_whole_program(benchmark: Any, dop: int) -> None:
         return renderer.n_samples
 
     assert benchmark(render_it) >= int(program.total_duration_s * RATE_HZ)
-
-
-def test_commands_for_the_dds(benchmark: Any) -> None:
-    program = Case(7, DDS_LIMITS).program()
-    cores = choose_cores("dds", SpcmSettings(mode="dds"), DDS_LIMITS, SiteGrid())
-    commands = benchmark(compile_commands, "dds", program, cores)
-    benchmark.extra_info["commands"] = len(commands.entries)
-    assert len(commands.ends) >= program.n_segments

@@ -37,11 +37,13 @@ def test_a_check_names_the_devices_that_it_did_not_ask_and_what_stays_on(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     warm = "profile.mobile_tweezers.keep_warm={row_frequency: 82.2 MHz, column_frequency: 117.8 MHz}"
-    overrides = [warm, "profile.static_tweezers.after_run=on"]
+    stream = ["profile.mobile_tweezers.mode=stream", "profile.mobile_tweezers.trigger=software"]
+    lines = "profile.lines={use: virtual, channels: {}}"
+    overrides = [*stream, lines, warm, "profile.static_tweezers.after_run=on"]
     check_sequence(Path(SEQUENCE), "lab", overrides, "off", as_json=False)
     shown = capsys.readouterr().out
     rows = {line.split(maxsplit=1)[0]: line for line in shown.splitlines() if line}
-    assert "camera, static_tweezers, mobile_tweezers, lines, shutter: " in rows["not"]
+    assert "camera, static_tweezers, mobile_tweezers, shutter: " in rows["not"]
     assert "stays on after the run" in rows["static_tweezers"]
     assert "82.2 MHz (2 mW) and 117.8 MHz (2 mW)" in rows["mobile_tweezers"]
     check_sequence(Path(SEQUENCE), "lab", [], "full", as_json=False)

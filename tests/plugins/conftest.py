@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm_sim import M4I6631, CardModel, SampleSpan, SimulatedCard, installed
+from labseq_spcm_sim import M4I6631, CardModel, SimulatedCard, installed
 from numpy.typing import NDArray
 
 from labseq.motion import tone_program
@@ -53,7 +53,6 @@ def bench() -> Iterator[OpenCard]:
 
 RATE_HZ = 250e6
 """Sample rate of the driver's tests, which is enough and renders fast."""
-DDS_MOTION = MotionSpec(max_row_tones=16, max_column_tones=5)
 
 
 @dataclass
@@ -93,7 +92,7 @@ class Lab:
 
     def samples(self, channel: int) -> NDArray[np.int16]:
         """From the first span to the last, with the silence between them."""
-        spans = [span for span in self.card.played(channel) if isinstance(span, SampleSpan)]
+        spans = self.card.played(channel)
         starts = [round((span.start_s - spans[0].start_s) * self.rate_hz) for span in spans]
         samples = np.zeros(starts[-1] + spans[-1].n_samples, np.int16)
         for start, span in zip(starts, spans, strict=True):
@@ -115,7 +114,7 @@ def open_driver(
     """Within the block the driver is open on a simulated card."""
     clock = clock or FakeClock()
     card = SimulatedCard(clock, model=model)
-    motion = motion or (DDS_MOTION if mode == "dds" else MotionSpec())
+    motion = motion or MotionSpec()
     with installed(card) as name:
         given = {"card": name, "mode": mode, "sample_rate": RATE_HZ, **settings}
         chosen = SpcmSettings.model_validate(given)

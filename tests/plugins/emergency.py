@@ -19,7 +19,7 @@ def attempt(call, arguments):
     except Exception as error:
         return f"{type(error).__name__}: {error}"
 prepared = {n: attempt(s["prepare"], a) if "prepare" in s else None for n, (s, a) in jobs.items()}
-heavy = {"numpy", "h5py", "numba", "pydantic", "labseq", "labseq_spcm", "labseq_soapy_stream", "spcm"}
+heavy = {"numpy", "h5py", "numba", "pydantic", "labseq", "labseq_spcm", "labseq_soapy_stream", "spcm_core"}
 print(json.dumps([prepared, sorted(heavy & set(sys.modules))]), flush=True)
 for line in sys.stdin:
     done = {}

@@ -14,8 +14,8 @@ from typing import Final
 
 from labseq_soapy_sim import read_trace
 from labseq_spcm_sim import registers as r
-from labseq_spcm_sim.emergency import ADDRESS, Connection
 
+from .card_process_emergency import ADDRESS, Connection
 from .labseq_serial_rig import Simulator
 
 DRIVING = """
@@ -24,7 +24,9 @@ from pathlib import Path
 import numpy as np
 from labseq_serial.device import SerialDevice
 from labseq_soapy.static_tweezers import SoapySettings, SoapyStaticTweezers
-from labseq_spcm.mobile_tweezers import SpcmMobileTweezers, SpcmSettings
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm import card as driver_card, replay_fifo
+from labseq_spcm.settings import SpcmSettings
 from labseq_spcm.stream import Stream
 from labseq_ttl.go_lines import ttl_lines
 from labseq_ttl.settings import TtlSettings
@@ -35,14 +37,17 @@ from labseq.plugin.motion import RfSpec
 from labseq.testing.contracts.instruments import SPECS
 from labseq.testing.fakes import FakeClock
 from labseq.watchdog import Watchdog
+from tests.plugins.card_process import TweezersOfProcess
 from tests.plugins.labseq_serial_rig import settings
 
 CLOCK = FakeClock()
-Stream._check_bus = lambda self: None  # samples go through a pipe, which may be slow
+# samples go through a pipe, which may be slow
+driver_card.TRANSFER_TIMEOUT_S = replay_fifo.TRANSFER_TIMEOUT_S = 60.0
+Stream._check_bus = lambda self: None
 TONES, BAND = np.linspace(12e6, 18e6, 5), (10e6, 20e6)
 GRID = SiteGrid(5, 5, row_frequency_hz=TONES, column_frequency_hz=TONES)
 RF = RfSpec(row_band_hz=BAND, column_band_hz=BAND)
-MOTION = MotionSpec(max_row_tones=16, max_column_tones=5, speed_m_s=1.5e-5, rf=RF)
+MOTION = MotionSpec(speed_m_s=1.5e-5, rf=RF)
 PLAN = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])] * 50)
 
 def shutter(folder, repeat):
@@ -61,10 +66,10 @@ def radio(folder, repeat):
     device = SoapyStaticTweezers(chosen, Context("static_tweezers", SiteGrid(3, 4)))
     return device, device.start
 
-def card(folder, repeat, mode, name="simulated@{}/{}{}"):
-    name = name.format(folder, mode, repeat)
+def card(folder, repeat, mode):
+    name = f"simulated@{folder}/{mode}{repeat}"
     chosen = SpcmSettings(card=name, mode=mode, sample_rate=50e6, trigger="software", fill=0.1)
-    device = SpcmMobileTweezers(chosen, Context("mobile_tweezers", GRID, motion=MOTION))
+    device = TweezersOfProcess(chosen, Context("mobile_tweezers", GRID, motion=MOTION))
     program = tone_program(PLAN, GRID, MOTION, 1 if mode == "replay" else 50)
     def play():
         device.play()
@@ -102,8 +107,9 @@ def fill_memory():
     resource.setrlimit(resource.RLIMIT_AS, (64 << 20, 64 << 20))
     full = [bytearray(1 << 20) for _ in range(1 << 20)]
 
-for mode in {"dds", "replay", "fifo", "stream"} & set(sys.argv[2:]):  # here, not again in every child
-    warmed, *_ = card(sys.argv[1], "", mode, "simulated")
+for mode in {"replay", "fifo", "stream"} & set(sys.argv[2:]):  # here, not again in every child
+    settings_here = SpcmSettings(card="simulated", mode=mode, sample_rate=50e6, fill=0.1)
+    warmed = SpcmMobileTweezers(settings_here, Context("mobile_tweezers", GRID, motion=MOTION))
     warmed.warm()
     load_kernels()
     warmed.open()
@@ -124,7 +130,7 @@ CAUSES: Final = {
     "C call": "ctypes.PyDLL(None).sleep(60)",
 }
 """What ends or stops the process."""
-CARDS: Final = ("dds", "fifo", "stream", "replay")
+CARDS: Final = ("fifo", "stream", "replay")
 """Simulated cards, by mode; replay comes last, because it plays for less than a second."""
 
 

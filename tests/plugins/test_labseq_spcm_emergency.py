@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -16,14 +17,15 @@ from labseq_soapy_sim import Ring
 from labseq_spcm import emergency as script
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm_sim import M4I6631, SimulatedCard, Span, installed, registers as r
-from labseq_spcm_sim.emergency import ADDRESS, Connection
+from labseq_spcm_sim import M4I6631, SampleSpan, SimulatedCard, installed, registers as r
 from labseq_spcm_sim.library import _library
 from labseq_spcm_sim.setup import Refusal
 
 from labseq.plugin import Context, DeviceError
 from labseq.testing.fakes import FakeClock
 
+from .card_process import PLUGIN, TweezersOfProcess
+from .card_process_emergency import ADDRESS, Connection
 from .emergency import Done, outsider
 from .labseq_soapy_rig import until
 from .small_run import PROFILE, SEQUENCE
@@ -35,9 +37,9 @@ from labseq.motion import tone_program
 from labseq.plugin import Context, MotionSpec, Plan, SiteGrid
 from labseq.plugin.motion import RfSpec
 from labseq_spcm import card, replay_fifo
-from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm.stream import Stream
+from tests.plugins.card_process import TweezersOfProcess
 
 # samples go through a pipe to another process: slow, and slower where others are busy
 card.TRANSFER_TIMEOUT_S = replay_fifo.TRANSFER_TIMEOUT_S = 60.0
@@ -48,31 +50,29 @@ grid = SiteGrid(5, 5, row_frequency_hz=tones, column_frequency_hz=tones)
 band = (10e6, 20e6)
 plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])] * 50)
 
-def tweezers(state, mode, speed_m_s, n_batches, trigger="software", keep_warm=None):
+def tweezers(state, mode, speed_m_s, n_batches, trigger="software", fill=0.1, keep_warm=None):
     rf = RfSpec(row_band_hz=band, column_band_hz=band)
-    motion = MotionSpec(max_row_tones=16, max_column_tones=5, speed_m_s=speed_m_s, eject_slots=0, rf=rf)
+    motion = MotionSpec(speed_m_s=speed_m_s, eject_slots=0, rf=rf)
     card = f"simulated@{sys.argv[1]}/{state}"
-    settings = dict(card=card, mode=mode, sample_rate=50e6, trigger=trigger, fill=0.1, keep_warm=keep_warm)
+    settings = dict(card=card, mode=mode, sample_rate=50e6, trigger=trigger, fill=fill, keep_warm=keep_warm)
     settings = SpcmSettings.model_validate(settings)
-    device = SpcmMobileTweezers(settings, Context("mobile_tweezers", grid, motion=motion))
+    device = TweezersOfProcess(settings, Context("mobile_tweezers", grid, motion=motion))
     device.open()
     if n_batches:
         device.prepare(tone_program(plan, grid, motion, n_batches))
     return device
 
 devices = {
+    # it plays for 0.7 s after the kill, which is longer than the script takes
+    "fifo": tweezers("fifo", "fifo", 1e-5, 50, fill=0.5),
     "armed": tweezers("armed", "replay", 0.130, 2, "external"),
     "played": tweezers("played", "replay", 0.130, 1),
-    "locked": tweezers("locked", "dds", 1e-5, 50),
-    "dds": tweezers("dds", "dds", 1e-5, 50),
-    "fifo": tweezers("fifo", "fifo", 1e-5, 50),
+    "locked": tweezers("locked", "fifo", 1e-5, 50),
     "replay": tweezers("replay", "replay", 1.5e-5, 1),  # played last: its program lasts for 0.3 s
 }
 parked = {"row_frequency": 10e6, "column_frequency": 10e6}
 idle = {
     "prepared": tweezers("prepared", "replay", 0.130, 1),
-    "warm": tweezers("warm", "replay", 0.130, 0, keep_warm=parked),
-    "warm_dds": tweezers("warm_dds", "dds", 0.130, 0, keep_warm=parked),
     "stream": tweezers("stream", "stream", 0.130, 0, keep_warm=parked),  # a program could run dry
 }
 jobs = {
@@ -82,20 +82,17 @@ jobs = {
 }
 print(json.dumps(jobs), flush=True)
 sys.stdin.readline()
-idle["warm"].settle()
-idle["warm_dds"].settle()
 idle["stream"].settle()
 for device in devices.values():
     device.play()
 threading.Thread(target=devices["fifo"].wait, args=(1e3,), daemon=True).start()
 devices["played"].wait(60.0)
 card = devices["locked"]._card
-assert card.spcm.spcm_dwSetParam_i64(card._card.handle(), 30010, 9000) == 0x101  # blocks the driver library
+assert card.spcm.spcm_dwSetParam_i64(card._handle, 30010, 9000) == 0x101  # blocks the driver library
 print("on", flush=True)
 sys.stdin.read()
 """
-STATES = {"prepared", "armed", "played", "locked", "replay", "fifo", "stream", "dds", "warm", "warm_dds"}
-ENDLESS = ("dds", "locked", "warm", "warm_dds")
+STATES = {"prepared", "armed", "played", "locked", "replay", "fifo", "stream"}
 OFF = "card stopped, outputs 0 and 1 disabled"
 
 
@@ -123,7 +120,7 @@ class Scope:
 
     def end_s(self, state: str, channel: int) -> float:
         """When the output of a channel ended; before the kill if it was silent then."""
-        spans: list[Span] = self.cards[state]("played", channel)
+        spans: list[SampleSpan] = self.cards[state]("played", channel)
         return max((span.end_s for span in spans), default=0.0)
 
 
@@ -131,18 +128,15 @@ class Scope:
 def scope(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scope]:
     scope = Scope(tmp_path_factory.mktemp("computer"))
     yield scope
-    scope.cards["dds"]("power_off")
+    scope.cards["fifo"]("power_off")
 
 
 def test_a_card_goes_on_after_the_process_has_died(scope: Scope) -> None:
-    """The reason for all of this: outputs on, and in the mode dds for ever."""
+    """The reason for all of this: without the script the relays stay closed, and an edge starts a card."""
     assert set(scope.after_death) == STATES
-    assert {scope.after_death[state] for state in ENDLESS} == {(True, (True, True))}
-    assert scope.after_death["replay"][1] == (True, True), "its relays, whether it still plays or not"
-    assert scope.after_death["armed"] == (True, (True, True)), "the next edge at Ext0 would start it"
-    assert scope.after_death["stream"][1] == (True, True), "its relays, whether it has run dry or not"
-    assert scope.after_death["played"] == (False, (True, True)), "stopped, but its relays are closed"
-    assert scope.after_death["prepared"] == (False, (True, True)), "likewise"
+    assert {relays for _, relays in scope.after_death.values()} == {(True, True)}
+    for state, is_running in {"fifo": True, "armed": True, "played": False, "prepared": False}.items():
+        assert scope.after_death[state][0] == is_running
 
 
 @pytest.mark.parametrize("state", sorted(STATES))
@@ -154,7 +148,7 @@ def test_a_plain_process_brings_its_outputs_to_zero(scope: Scope, state: str) ->
     for channel in (0, 1):
         end_s = scope.end_s(state, channel)
         assert end_s <= done.end_s
-        if state in ENDLESS:
+        if state == "fifo":
             assert end_s > done.start_s, "it played until then"
     assert scope.again[state].text == done.text, "it can be repeated"
     assert not scope.heavy_modules
@@ -163,8 +157,8 @@ def test_a_plain_process_brings_its_outputs_to_zero(scope: Scope, state: str) ->
 def test_the_script_stops_the_card_first_and_writes_the_set_up_to_open_the_relays(scope: Scope) -> None:
     mine = [
         (entry.register, entry.value)
-        for entry in scope.writes["dds"]
-        if scope.off["dds"].start_s <= entry.time_s <= scope.off["dds"].end_s
+        for entry in scope.writes["fifo"]
+        if scope.off["fifo"].start_s <= entry.time_s <= scope.off["fifo"].end_s
     ]
     assert mine == [
         (r.SPC_M2CMD, r.M2CMD_CARD_STOP | r.M2CMD_DATA_STOPDMA),
@@ -173,14 +167,13 @@ def test_the_script_stops_the_card_first_and_writes_the_set_up_to_open_the_relay
         (r.SPC_ENABLEOUT0, 0),
         (r.SPC_ENABLEOUT1, 0),
         (r.SPC_M2CMD, r.M2CMD_CARD_WRITESETUP),
-        (r.SPC_DDS_CMD, r.SPCM_DDS_CMD_RESET),
         (r.SPC_M2CMD, r.M2CMD_CARD_RESET),
     ]
 
 
 def test_its_numbers_are_those_of_the_vendor() -> None:
     names = [name for name in vars(script) if name.startswith(("SPC", "M2"))]
-    assert len(names) == 13
+    assert len(names) == 11
     assert {name: getattr(script, name) for name in names} == {name: getattr(r, name) for name in names}
 
 
@@ -191,8 +184,8 @@ LIBRARY = "libspcm_that_is_not_installed.so"
 def test_a_missing_library_and_wrong_arguments_give_one_clear_line() -> None:
     path = str(Path(script.__file__))
     jobs = {
-        "library": (path, {"library": LIBRARY, "card": "/dev/spcm0", "mode": "dds"}),
-        "name": (path, {"library": LIBRARY, "card": 0, "mode": "dds"}),
+        "library": (path, {"library": LIBRARY, "card": "/dev/spcm0"}),
+        "name": (path, {"library": LIBRARY, "card": 0}),
         "argument": (path, {"crad": "/dev/spcm0"}),
     }
     with outsider(jobs) as outside:
@@ -224,7 +217,7 @@ def test_the_functions_of_a_c_library_are_called_as_its_header_declares_them(tmp
     (tmp_path / "spcm.c").write_text(C_LIBRARY)
     library = tmp_path / "libspcm_linux.so"
     subprocess.run(["cc", "-shared", "-fPIC", "-w", "-o", library, tmp_path / "spcm.c"], check=True)
-    arguments = {"library": str(library), "card": "/dev/spcm7", "mode": "replay"}
+    arguments = {"library": str(library), "card": "/dev/spcm7"}
     code = f"import runpy; print(runpy.run_path({script.__file__!r})['off'](**{arguments!r}))"
     done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == [
@@ -250,7 +243,6 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stubborn]:
     """A card in this process, which the script finds as ``simulated``; it plays, with its outputs on."""
     card = Stubborn(FakeClock())
     for register, value in (
-        (r.SPC_CARDMODE, r.SPC_REP_STD_DDS),
         (r.SPC_ENABLEOUT0, 1),
         (r.SPC_ENABLEOUT1, 1),
         (r.SPC_M2CMD, r.M2CMD_CARD_START),
@@ -279,28 +271,28 @@ def test_a_card_that_a_dying_process_still_holds_is_waited_for(
 
     monkeypatch.setattr(script, "time", SimpleNamespace(monotonic=lambda: now_s, sleep=sleep))
     assert card.acquire()
-    assert script.off("", CARD, "dds") == OFF
+    assert script.off("", CARD) == OFF
     assert 0.5 < now_s < 0.51
     assert card.acquire(), "the script has closed it"
     now_s, gives_back_s = 0.0, 1e9
     with pytest.raises(script.EmergencyError, match=f"'{CARD}' .*2 s: .*in use"):
-        script.off("", CARD, "dds")
+        script.off("", CARD)
 
 
 def test_the_reset_of_the_card_makes_up_for_a_step_that_is_refused(card: Stubborn) -> None:
     card.refused = ((r.SPC_ENABLEOUT0, 0),)
-    done, refused = script.off("", CARD, "dds").split("; refused: ")
+    done, refused = script.off("", CARD).split("; refused: ")
     assert done.endswith("disabled by its reset")
     assert "SPC_ENABLEOUT0 (30091): not now" in refused
     assert (card.running, card.outputs_on) == (False, (False, False))
     card.refused += ((r.SPC_M2CMD, r.M2CMD_CARD_RESET),)
     with pytest.raises(script.EmergencyError, match=r"SPC_ENABLEOUT0 .*; reset .*SPC_M2CMD \(100\): not now"):
-        script.off("", CARD, "dds")
+        script.off("", CARD)
 
 
 def test_without_the_reset_the_outputs_are_off_all_the_same(card: Stubborn) -> None:
     card.refused = ((r.SPC_M2CMD, r.M2CMD_CARD_RESET),)
-    assert "refused: reset of the card: SPC_M2CMD (100)" in script.off("", CARD, "replay")
+    assert "refused: reset of the card: SPC_M2CMD (100)" in script.off("", CARD)
     assert (card.running, card.outputs_on) == (False, (False, False))
 
 
@@ -308,16 +300,16 @@ def test_a_card_in_use_elsewhere_is_refused_and_one_that_dies_with_labseq_needs_
     tmp_path: Path,
 ) -> None:
     name = f"simulated@{tmp_path / 'card'}"
-    shared = SpcmMobileTweezers(SpcmSettings(card=name), Context("mobile_tweezers"))
-    assert shared.emergency() is None, "it is not open"
-    shared.open()
+    elsewhere = TweezersOfProcess(SpcmSettings(card=name), Context("mobile_tweezers"))
+    assert elsewhere.emergency() is None, "it is not open"
+    elsewhere.open()
     other = Connection(str(tmp_path / "card"))
     try:
         assert not other("acquire"), "one owner"
-        shared.close()
+        elsewhere.close()
         assert other("acquire")
         with pytest.raises(DeviceError, match="is in use"):
-            shared.open()
+            elsewhere.open()
     finally:
         other("power_off")
     inside = SpcmMobileTweezers(SpcmSettings(card="simulated"), Context("mobile_tweezers"))
@@ -333,15 +325,17 @@ def test_a_run_that_is_killed_leaves_card_and_radio_off(tmp_path: Path) -> None:
         f"device: 'simulated,speed=1,buffer=0.02,record=100000000,folder={tmp_path}', sample_rate: 1.2 MHz"
     )
     static = f"{{use: soapy, {radio}, row_frequency: {comb}, column_frequency: {comb}}}"
-    tones = "max_row_tones: 16, max_column_tones: 5"
-    mobile = f"{{use: spcm, card: simulated@{tmp_path}/card, mode: dds, {tones}}}"
-    profile = PROFILE.replace("STATIC", static).replace("MOBILE", mobile)
+    mobile = f"{{use: spcm_process, card: simulated@{tmp_path}/card, mode: fifo, sample_rate: 250 MHz}}"
+    profile = PROFILE.replace("STATIC", static).replace("MOBILE", mobile) + "plugin_folders: [plugins]\n"
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "card.py").write_text(PLUGIN, encoding="utf-8")
     (tmp_path / "p.yaml").write_text(profile, encoding="utf-8")
     (tmp_path / "s.yaml").write_text(SEQUENCE, encoding="utf-8")
     output = tmp_path / "output"
     command = [sys.executable, "-m", "labseq", "run", "s.yaml", "--shots", "1000", "--output", "runs"]
+    root = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     with output.open("wb") as file:
-        labseq = subprocess.Popen(command, cwd=tmp_path, stdout=file, stderr=subprocess.STDOUT)
+        labseq = subprocess.Popen(command, cwd=tmp_path, stdout=file, stderr=subprocess.STDOUT, env=root)
 
     def is_ready(condition: Callable[[], bool]) -> Callable[[], bool]:
         def check() -> bool:
@@ -353,7 +347,7 @@ def test_a_run_that_is_killed_leaves_card_and_radio_off(tmp_path: Path) -> None:
     try:
         until(is_ready((tmp_path / ADDRESS).exists), 120.0)
         card = Connection(str(tmp_path / "card"))
-        until(is_ready(lambda: card("state") == (True, (True, True))), 120.0)
+        until(is_ready(lambda: card("state")[1] == (True, True)), 120.0)
     finally:
         labseq.kill()
         labseq.wait()

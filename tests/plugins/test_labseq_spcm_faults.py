@@ -19,25 +19,22 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from labseq_spcm.dds import Dds
 from labseq_spcm.library import VendorLibrary, load_spcm
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm.stream import Stream
 from labseq_spcm_sim import M4I6631, SimulatedCard, SimulatedLibrary, vendor_library_found
-from labseq_spcm_sim.emergency import Connection
 
-from labseq.motion import tone_program
-from labseq.plugin import Context, DeviceError, DeviceTimeoutError, LabseqError, LimitError, MotionSpec, Plan
+from labseq.plugin import Context, DeviceError, DeviceTimeoutError, LabseqError, LimitError, MotionSpec
 from labseq.plugin.messages import install_hint
 from labseq.plugin.motion import RfSpec
 from labseq.testing.fakes import FakeClock
 
 from .small_run import run
 
-MODES = ["replay", "fifo", "stream", "dds"]
-TRIGGERED = ["replay", "fifo", "dds"]
+MODES = ["replay", "fifo", "stream"]
+TRIGGERED = ["replay", "fifo"]
 
 
 def context(motion: MotionSpec | None = None) -> Context:
@@ -82,7 +79,7 @@ class TestCards:
             lab.play(lab.program())
 
 
-@pytest.mark.parametrize(("mode", "timeout_s"), [("replay", 0.0), ("fifo", 50e-3), ("dds", 50e-3)])
+@pytest.mark.parametrize(("mode", "timeout_s"), [("replay", 0.0), ("fifo", 50e-3)])
 def test_a_trigger_that_never_comes_times_out_into_the_safe_state(
     driver: Any, mode: str, timeout_s: float
 ) -> None:
@@ -96,9 +93,7 @@ def test_a_trigger_that_never_comes_times_out_into_the_safe_state(
         lab.tweezers.prepare(lab.program())
 
 
-@pytest.mark.parametrize(
-    ("mode", "player"), [("replay", Replay), ("fifo", Fifo), ("stream", Stream), ("dds", Dds)]
-)
+@pytest.mark.parametrize(("mode", "player"), [("replay", Replay), ("fifo", Fifo), ("stream", Stream)])
 def test_a_wait_during_which_another_thread_makes_the_card_safe_is_no_end_of_the_program(
     driver: Any, mode: str, player: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,7 +151,6 @@ def test_a_program_longer_than_the_memory_is_refused(driver: Any) -> None:
 
 
 AMP0, TIMEOUT = 30010, 295130
-CORES_ON_CH1 = 608041
 
 
 @pytest.fixture
@@ -173,14 +167,14 @@ import labseq_spcm
 from labseq.registry import Registry
 labseq_spcm.labseq_register(Registry())
 assert not {"labseq_spcm_sim", "numba", "matplotlib"} & sys.modules.keys()
-from labseq.plugin import Context, LabseqError, MotionSpec
+from labseq.plugin import Context, LabseqError
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
-context = Context("mobile_tweezers", motion=MotionSpec(max_row_tones=16, max_column_tones=4))
-tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated", mode="dds"), context)
-assert "spcm" not in sys.modules
+tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated"), Context("mobile_tweezers"))
+assert "spcm_core" not in sys.modules
 tweezers.warm()
-assert "spcm" in sys.modules
+assert "spcm_core" in sys.modules
+assert not {"spcm", "matplotlib"} & sys.modules.keys()
 tweezers.open()
 tweezers.close()
 print("warm")
@@ -208,7 +202,7 @@ class TestFaultsOfThePackage:
     ) -> None:
         gc.collect()
         unraisable.clear()  # what other tests left behind
-        with driver("dds") as lab:
+        with driver() as lab:
             lab.card.write(AMP0, 9000)  # also with an error pending
         gc.collect()
         assert not unraisable
@@ -219,21 +213,6 @@ class TestFaultsOfThePackage:
         assert (another_process.returncode, another_process.stderr) == (0, "")
         n_refusals = 0 if vendor_library_found() else 2
         assert another_process.stdout.count("\n") == 1 + n_refusals
-
-
-class TestBehaviourOfTheCard:
-    def test_a_snapped_mask_is_noticed(self, driver: Any) -> None:
-        with driver("dds") as lab, pytest.raises(DeviceError, match="was set to 1, and the card reads"):
-            lab.tweezers._card.set(CORES_ON_CH1, 1, "cores of output 1")
-
-    def test_the_first_dds_block_is_not_lost_in_run_after_run(self, driver: Any) -> None:
-        with driver("dds") as lab:
-            program = tone_program(Plan.from_batches([([(0, 0)], [(0, 3)])]), motion=lab.motion)
-            for _ in range(3):
-                lab.card.forget(1e9)
-                lab.play(program)
-                spans = lab.card.played(1)
-                assert spans[-1].end_s - spans[0].start_s == pytest.approx(223.6e-6, abs=0.2e-6)
 
 
 @pytest.mark.skipif(vendor_library_found(), reason="the vendor's library is installed here")
@@ -248,10 +227,9 @@ def test_opening_without_the_library_names_the_package_and_the_simulated_card(
 
 
 def test_a_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "spcm", None)
-    with pytest.raises(
-        DeviceError, match=rf"'spcm' cannot be imported .*; install it with {install_hint('', 'spcm')}$"
-    ):
+    monkeypatch.setitem(sys.modules, "spcm_core", None)
+    hint = install_hint("", "spcm_core")
+    with pytest.raises(DeviceError, match=rf"'spcm_core' cannot be imported .*; install it with {hint}$"):
         load_spcm("mobile_tweezers", VendorLibrary("/dev/spcm0"))
 
 
@@ -268,7 +246,6 @@ def test_closing_goes_through_even_if_the_card_is_broken(driver: Any) -> None:
     [
         "{use: spcm, card: simulated, sample_rate: 250 MHz}",
         "{use: spcm, card: simulated, mode: fifo, sample_rate: 250 MHz}",
-        "{use: spcm, card: simulated, mode: dds, max_row_tones: 16, max_column_tones: 5}",
     ],
 )
 def test_a_simulated_card_plays_in_virtual_time_from_the_edge_of_a_line_on(
@@ -291,17 +268,6 @@ LINE = (
     "\nlines: {use: virtual, channels: {awg: {channel: 7, on: [rearrange], pulse: 0.1 ms, "
     "triggers: mobile_tweezers}}}"
 )
-
-
-def test_a_line_starts_a_card_that_outlives_the_process(tmp_path: Path) -> None:
-    tones = "max_row_tones: 16, max_column_tones: 5"
-    card = tmp_path / "card"
-    try:
-        done = run(tmp_path, mobile=f"{{use: spcm, card: simulated@{card}, mode: dds, {tones}}}{LINE}")
-        assert (done.status, len(done.shots), done.shots[0].attempt) == ("complete", 1, 0)
-        assert not Connection(str(card))("state")[0]
-    finally:
-        Connection(str(card))("power_off")
 
 
 @pytest.mark.parametrize(
@@ -348,7 +314,11 @@ def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
         ("mode: stream, notify_size: 5000", 2, "notify_size is 5000; expected a power of two"),
         ("mode: stream, card_buffer: 8192", 2, "at least notify_size, 65536"),
         (f"mode: stream}}{LINE[:-1]}", 2, "a line triggers it, but mode: stream"),
-        ("mode: dds", 2, "max_row_tones and max_column_tones .* 16 and 5"),
+        (
+            "keep_warm: {row_frequency: 82 MHz, column_frequency: 118 MHz}",
+            2,
+            "keep_warm is set, but mode: replay leaves the AODs dark",
+        ),
         ("rf: {full_scale: 3 V}", 2, "rf.full_scale is 3 V; .* 80 mV"),
     ],
 )

@@ -8,6 +8,7 @@ one has opened them and turned them on.
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
@@ -16,10 +17,11 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.plugins.card_process import PLUGIN
 from tests.plugins.outputs_rig import Outputs, outputs
 from tests.remote.conftest import free_port
 
-NAMES = ("shutter", "dds", "radio")
+NAMES = ("shutter", "fifo", "radio")
 TONES = "{centre: 15 MHz, step: 1.5 MHz}"
 PROFILE = """\
 labseq: 1
@@ -33,13 +35,12 @@ static_tweezers:
   row_frequency: {{centre: 100 MHz, step: 60 kHz}}
   column_frequency: {{centre: 100 MHz, step: 60 kHz}}
 mobile_tweezers:
-  use: spcm
-  card: simulated@{folder}/dds0
-  mode: dds
+  use: spcm_process
+  card: simulated@{folder}/fifo0
+  mode: fifo
   sample_rate: 50 MHz
+  fill: 0.1 s
   trigger: software
-  max_row_tones: 16
-  max_column_tones: 5
   speed: 0.015 um/ms
   rf: {{row_band: [10 MHz, 20 MHz], column_band: [10 MHz, 20 MHz]}}
 devices:
@@ -53,6 +54,7 @@ devices:
       close: {{send: CLOSE, reply: OK, repeatable: true}}
     safe_state: [close]
 detector: {{use: threshold}}
+plugin_folders: [plugins]
 """
 CLIENT = """
 import sys
@@ -85,7 +87,10 @@ sys.stdin.read()
 @contextmanager
 def _process(*command: str, until: str) -> Generator[subprocess.Popen[str]]:
     pipe = subprocess.PIPE
-    process = subprocess.Popen([sys.executable, *command], stdin=pipe, stdout=pipe, text=True)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    process = subprocess.Popen(
+        [sys.executable, *command], stdin=pipe, stdout=pipe, text=True, env=environment
+    )
     try:
         assert process.stdout is not None
         assert any(until in line for line in process.stdout), f"it ended before it printed '{until}'"
@@ -96,6 +101,8 @@ def _process(*command: str, until: str) -> Generator[subprocess.Popen[str]]:
 
 
 def _profiles(folder: Path, port: int) -> None:
+    (folder / "plugins").mkdir()
+    (folder / "plugins" / "card.py").write_text(PLUGIN, encoding="utf-8")
     served = PROFILE.format(folder=folder, tones=TONES)
     (folder / "served.yaml").write_text(served, encoding="utf-8")
     at = f"use: remote, address: 'tcp://127.0.0.1:{port}', device: "
@@ -105,7 +112,7 @@ name: client
 grid: {{rows: 3, cols: 4, spacing: 4.49 um, row_frequency: {TONES}, column_frequency: {TONES}}}
 camera: {{use: virtual}}
 static_tweezers: {{{at} static_tweezers}}
-mobile_tweezers: {{{at} mobile_tweezers, max_row_tones: 16, max_column_tones: 5, speed: 0.015 um/ms, \
+mobile_tweezers: {{{at} mobile_tweezers, speed: 0.015 um/ms, \
 rf: {{row_band: [10 MHz, 20 MHz], column_band: [10 MHz, 20 MHz]}}}}
 devices: {{shutter: {{{at} shutter}}}}
 detector: {{use: threshold}}

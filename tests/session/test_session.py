@@ -122,7 +122,7 @@ def test_a_missing_plugin_is_replaced_in_a_dry_run_with_a_warning(tmp_path):
 
 
 def test_a_dry_run_needs_no_vendors_package(monkeypatch):
-    missing = {"mobile_tweezers": "spcm"}
+    missing = {"mobile_tweezers": "spcm_core"}
     find = importlib.util.find_spec
     find_some = lambda name: None if name in missing.values() else find(name)  # noqa: E731
     monkeypatch.setattr("labseq.messages.find_spec", find_some)

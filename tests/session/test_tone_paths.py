@@ -84,7 +84,6 @@ shot:
   - rearrange: {cycles: 1, window: 60 ms, exposure: 45 ms}
 """
 MOBILE = "profile.mobile_tweezers"
-FEW_TONES = (f"{MOBILE}.max_row_tones=4", f"{MOBILE}.max_column_tones=4")
 SMALL = (
     "profile.grid.rows=5",
     "profile.grid.cols=5",
@@ -108,12 +107,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("virtual", ()),
         ("bench_awg", ()),
         ("bench_awg", (f"{MOBILE}.mode=stream",)),
-        ("bench_awg", (f"{MOBILE}.mode=dds", *FEW_TONES)),
     ],
-    ids=["virtual", "replay", "stream", "dds"],
+    ids=["virtual", "replay", "stream"],
 )
 def test_atoms_end_where_the_plan_says(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
-    """On the simulation of the program, and of the samples and the commands that the card played."""
+    """On the simulation of the program, and of the samples that the card played."""
     with labseq.Session.open(
         folder / "s.yaml", profile=profile, seed=1, output=folder / "runs", overrides=(*SMALL, *overrides)
     ) as session:

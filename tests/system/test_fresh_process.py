@@ -29,7 +29,7 @@ import labseq
 
 def loaded():
     heavy = {"h5py", "matplotlib", "numba", "numpy", "pluggy", "pydantic", "rich", "scipy", "serial", "yaml"}
-    vendors = {"gi", "pypylon", "SoapySDR", "spcm"}
+    vendors = {"gi", "pypylon", "SoapySDR", "spcm", "spcm_core"}
     plugins = {name for name in sys.modules if name.startswith("labseq_")}
     return sorted((heavy | vendors | plugins) & set(sys.modules))
 

@@ -1,8 +1,7 @@
-"""Simulated cards in a process of their own, as real ones are hardware of their own.
+"""Simulated cards in a process of their own, as real ones are hardware of their own: for the kill tests.
 
-``card: simulated@FOLDER/NAME`` opens one. It goes on after the process that uses it has died, and another
-process can open it then. This module is both: the class :class:`SharedCard`, with which the driver library
-calls such a card, and the process, ``python -m labseq_spcm_sim.shared FOLDER``.
+They go on after the process that uses them has died, and another process can open them then. This module is
+both: the driver on such a card, and the process, ``python -m tests.plugins.card_process FOLDER``.
 """
 
 from __future__ import annotations
@@ -18,50 +17,102 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterable
 from contextlib import suppress
 from multiprocessing.connection import Listener
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.settings import SpcmSettings
+from labseq_spcm_sim import (
+    M4I6631,
+    ErrorInfo,
+    SampleSpan,
+    SimulatedCard,
+    SimulatedLibrary,
+    install,
+    registers as r,
+)
+from labseq_spcm_sim.card import LogEntry
+from labseq_spcm_sim.modes import Buffer
+from labseq_spcm_sim.setup import Number
 
-from labseq.plugin import DeviceError
-from labseq_spcm_sim import registers as r
-from labseq_spcm_sim.card import LogEntry, SimulatedCard
-from labseq_spcm_sim.emergency import ADDRESS, Connection
-from labseq_spcm_sim.modes import PAGE, Buffer
-from labseq_spcm_sim.output import Span
-from labseq_spcm_sim.setup import M4I6631, ErrorInfo, Number
+from labseq.plugin import Context, Emergency
 
-START_S: Final = 30.0
+from .card_process_emergency import ADDRESS, Connection
+
+START_S: Final = 60.0
 """How long the process of the cards may take to start."""
 UNUSED_S: Final = 60.0
 """After so long without any connection the process of the cards ends."""
 
 
-class SharedCard:
-    """A simulated card in a process of its own. It has the methods of a ``SimulatedCard``.
+PLUGIN: Final = """
+from labseq.plugin import hookimpl
+from labseq_spcm.settings import SpcmSettings
+from tests.plugins.card_process import TweezersOfProcess
 
-    A transfer by DMA becomes a copy through a pipe, at some 1 GB/s. Samples that the driver changes after it
-    has handed them over are sent at its next call; the first 8 bytes of each 4 KiB tell.
+LABSEQ_API = 1
+
+@hookimpl
+def labseq_register(registry):
+    registry.mobile_tweezers("spcm_process", TweezersOfProcess, SpcmSettings)
+"""
+"""For a folder of plugins: ``use: spcm_process``, where this repository is in PYTHONPATH."""
+
+
+class TweezersOfProcess(SpcmMobileTweezers):
+    """The driver on a card of the process: ``card: simulated@FOLDER/NAME``."""
+
+    def __init__(self, settings: SpcmSettings, context: Context) -> None:
+        super().__init__(settings, context)
+        self.library = LibraryOfProcess(settings, context)
+
+
+class LibraryOfProcess(SimulatedLibrary):
+    """The simulator's library with a card of the process."""
+
+    def __init__(self, settings: SpcmSettings, context: Context) -> None:
+        super().__init__(settings.card, context.clock, context.simulation, settings.row_channel)
+        self._path = str(Path(settings.card.partition("@")[2]).absolute())
+        self._script: Path | None = None
+
+    def connect(self) -> str:
+        """Make the card available, in a new process if there is none."""
+        self.card = cast("SimulatedCard", ProcessCard(self._path))
+        self.wire(self.card)
+        return install(self.card)
+
+    def disconnect(self) -> None:
+        """Close the connection; the card goes on."""
+        card = self.card
+        super().disconnect()
+        if isinstance(card, ProcessCard):
+            card.disconnect()
+
+    def emergency(self, script: Path) -> Emergency | None:
+        """The driver's script, unchanged, on a library whose functions ask the process."""
+        own = {"script": str(script), "library": "of the simulator", "card": self._path}
+        return Emergency(Path(__file__).with_name("card_process_emergency.py"), own)
+
+
+class ProcessCard:
+    """A card of the process. It has the methods of a ``SimulatedCard``.
+
+    A transfer by DMA becomes a copy through a pipe, at some 1 GB/s, when samples are handed over.
 
     Args:
-        path: Path of the card. The process is started if there is none.
-
-    Raises:
-        DeviceError: It does not start.
+        path: Path of the card.
     """
 
     model = M4I6631
 
     def __init__(self, path: str) -> None:
-        self._path = str(Path(path).absolute())
-        self._ask = _connected(self._path)
+        self._ask = _connected(path)
         self._buffer: Buffer | None = None
-        self._sent = np.empty(0, np.uint8)
         self._n_handed = 0
-        self._is_stream = False
+        self._is_fifo = False
         self._fault = ErrorInfo()
 
     def acquire(self) -> bool:
@@ -77,56 +128,29 @@ class SharedCard:
         self._ask.close()
 
     def write(self, register: int, value: Number) -> int:
-        """Write one register."""
-        return self.write_all([(register, value)])
-
-    def write_all(self, writes: Iterable[tuple[int, Number]]) -> int:
-        """Write registers; samples that a command hands over go first."""
-        entries = list(writes)
-        for register, value in entries:
-            if register == r.SPC_DATA_AVAIL_CARD_LEN:
-                self._hand_over(int(value))
-            elif register == r.SPC_M2CMD and int(value) & r.M2CMD_DATA_STARTDMA and not self._is_stream:
-                self._hand_over(self._buffer.n_bytes if self._buffer else 0)
-        return int(self._ask("write_all", entries))
+        """Write one register; samples that a command hands over go first."""
+        if register == r.SPC_DATA_AVAIL_CARD_LEN:
+            self._hand_over(int(value))
+        elif register == r.SPC_M2CMD and int(value) & r.M2CMD_DATA_STARTDMA and not self._is_fifo:
+            self._hand_over(self._buffer.n_bytes if self._buffer else 0)
+        return int(self._ask("write_all", [(register, value)]))
 
     def _hand_over(self, n_bytes: int) -> None:
         if self._buffer is not None and 0 < n_bytes <= self._buffer.n_bytes:
-            self._send(self._n_handed % self._buffer.n_bytes, n_bytes)
+            start = self._n_handed % self._buffer.n_bytes
+            self._ask("fill", start, self._buffer.fetch(start, n_bytes).tobytes())
             self._n_handed += n_bytes
-
-    def _send(self, start: int, n_bytes: int) -> None:
-        assert self._buffer is not None
-        data = self._buffer.fetch(start, n_bytes).view(np.uint8)
-        self._ask("fill", start, data.tobytes())
-        if len(self._sent):
-            head = min(n_bytes, len(self._sent) - start)
-            self._sent[start : start + head] = data[:head]
-            self._sent[: n_bytes - head] = data[head:]
-
-    def _send_changes(self) -> None:
-        """Send the pages of a stream's ring whose first samples differ from those that were sent."""
-        if self._buffer is not None and self._n_handed and len(self._sent):
-            now = self._buffer.fetch(0, self._buffer.n_bytes).view(np.int64)[:: PAGE // 8]
-            differ = now != self._sent.view(np.int64)[:: PAGE // 8]
-            edges = np.flatnonzero(np.diff(differ, prepend=False, append=False))
-            for first, end in edges.reshape(-1, 2).tolist():
-                self._send(first * PAGE, (end - first) * PAGE)
 
     def read(self, register: int) -> tuple[int, Number]:
         """Read one register: the error code and the value."""
-        if register == r.SPC_DATA_AVAIL_USER_LEN:
-            self._send_changes()
         code, value = self._ask("read", register)
         return code, value
 
     def define_transfer(self, kind: int, direction: int, offset: int, buffer: Buffer) -> int:
         """Name the buffer of the next transfer."""
         self._buffer, self._n_handed = buffer, 0
-        place = buffer.address % PAGE, buffer.n_bytes, buffer.notify_bytes
-        code, self._is_stream = self._ask("define_transfer", kind, direction, offset, *place)
-        is_watched = self._is_stream and buffer.n_bytes % PAGE == 0
-        self._sent = np.zeros(buffer.n_bytes if is_watched else 0, np.uint8)
+        place = buffer.address % mmap.PAGESIZE, buffer.n_bytes, buffer.notify_bytes
+        code, self._is_fifo = self._ask("define_transfer", kind, direction, offset, *place)
         return int(code)
 
     def invalidate(self) -> int:
@@ -148,7 +172,7 @@ class SharedCard:
         with suppress(OSError, EOFError):
             self._ask("trigger_at", time_s)
 
-    def played(self, channel: int) -> list[Span]:
+    def played(self, channel: int) -> list[SampleSpan]:
         """The output of a channel up to now; see ``SimulatedCard.played``."""
         return list(self._ask("played", channel))
 
@@ -164,9 +188,13 @@ def _connected(card: str) -> Connection:
     folder = Path(card).parent
     folder.mkdir(parents=True, exist_ok=True)
     nothing = subprocess.DEVNULL
-    command = [sys.executable, "-P", "-m", __name__, str(folder)]
-    process = subprocess.Popen(  # noqa: S603 - our own module
-        command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True
+    process = subprocess.Popen(
+        [sys.executable, "-m", __name__, str(folder)],
+        cwd=Path(__file__).parents[2],
+        stdin=nothing,
+        stdout=nothing,
+        stderr=nothing,
+        start_new_session=True,
     )
     threading.Thread(target=process.wait, daemon=True).start()  # its exit code is taken when it ends
     deadline_s = time.monotonic() + START_S
@@ -174,7 +202,7 @@ def _connected(card: str) -> Connection:
         with suppress(OSError, ValueError):
             return Connection(card)
         time.sleep(5e-3)
-    raise DeviceError("spcm simulator", f"the process of the card '{card}' does not start")
+    raise TimeoutError(f"the process of the card '{card}' does not start")
 
 
 # The process of the cards
@@ -202,6 +230,7 @@ class _Opened:
         self._card = card
         self._owns = False
         self._memory = mmap.mmap(-1, mmap.PAGESIZE)
+        self._shift = 0
 
     def acquire(self) -> bool:
         self._owns = self._owns or self._card.acquire()
@@ -227,7 +256,7 @@ class _Opened:
         address = ctypes.addressof(ctypes.c_char.from_buffer(self._memory)) + shift
         self._shift = shift
         code = self._card.define_transfer(kind, direction, offset, Buffer(address, n_bytes, notify))
-        return code, self._card.streams
+        return code, self._card._machine.fifo is not None
 
     def fill(self, start: int, data: bytes) -> None:
         """Samples of the owner's buffer, from byte ``start`` on and around its end."""
@@ -246,7 +275,7 @@ class _Opened:
 
     # Instruments: they need not own the card
 
-    def played(self, channel: int) -> list[Span]:
+    def played(self, channel: int) -> list[SampleSpan]:
         return self._card.played(channel)
 
     def forget(self, before_s: float) -> None:

@@ -17,8 +17,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
 
-PREFIX: Final = "simulated@"
-"""Then follows the path of a card: a folder, which its computer's cards share, and its name there."""
 ADDRESS: Final = "cards.json"
 """File in the folder with the address of the process of the cards."""
 HANDLE: Final = 1
@@ -72,7 +70,7 @@ class _Driver:
 
     def _open(self, name: bytes) -> int | None:
         try:
-            card = Connection(name.decode().removeprefix(PREFIX))
+            card = Connection(name.decode())
             if card("acquire"):
                 self._card = card
                 return HANDLE
