@@ -202,6 +202,15 @@ def test_a_helper_is_loaded_only_to_compile_what_calls_it_or_when_python_does(pa
         top.MIDDLE("text")
 
 
+def test_a_helper_without_a_signature_is_compiled_as_part_of_what_calls_it(package: Package) -> None:
+    package.write("middle", MIDDLE.format(package=package.name).replace('"int64(int64)"', ""))
+    assert compiled_modules(package.load) == ["top", "middle", "leaf"]
+    assert compiled_modules(package.load) == []
+    package.write("leaf", LEAF.format(step=2))
+    assert package.result() == 104
+    assert package.define().MIDDLE(0.5) == 2 * 2  # leaf takes whole numbers
+
+
 def test_a_kernel_is_loaded_by_its_first_call(package: Package) -> None:
     top = package.define()
     assert compiled_modules(lambda: top.top(0)) == ["top", "middle", "leaf"]

@@ -79,10 +79,11 @@ def c_address(function: Callable[..., Any]) -> int:
     return cast("_Kernel", function).c_address
 
 
-def helper_kernel(signature: str | Sequence[str], *, fused: bool = False) -> Callable[[F], F]:
+def helper_kernel(signature: str | Sequence[str] = (), *, fused: bool = False) -> Callable[[F], F]:
     """Like :func:`kernel`, for a function that only kernels call: nothing to load if they are in the cache.
 
-    Python may call it, too; the first call then compiles it, or loads it from the cache.
+    Without a signature numba infers the types, and the function is compiled as part of each kernel that
+    calls it. Python may call it, too; the first call then compiles it, or loads it from the cache.
     """
     return _decorator(signature, fused, is_helper=True)
 
@@ -192,7 +193,8 @@ class _Kernel:
         self._options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"} if fused else False}
         self._dispatchers: dict[str, Any] = {}
         self._call: Callable[..., Any] = self._first_call
-        _PENDING[self] = None
+        if signatures:
+            _PENDING[self] = None
 
     def __call__(self, *args: Any) -> Any:
         return self._call(*args)
@@ -215,7 +217,9 @@ class _Kernel:
 
     def _dispatcher(self, kind: str) -> Any:
         with _LOADING:
-            if kind not in self._dispatchers:
+            if not self.signatures and kind not in self._dispatchers:
+                self._compile(kind, cache=False)  # its callers' caches hold it
+            elif kind not in self._dispatchers:
                 self._cached(kind, partial(self._compile, kind))
         return self._dispatchers[kind]
 
@@ -229,7 +233,8 @@ class _Kernel:
         except BaseException:
             del self._dispatchers[kind]
             raise
-        dispatcher.disable_compile()
+        if self.signatures:
+            dispatcher.disable_compile()
 
     @cached_property
     def c_address(self) -> int:
@@ -300,7 +305,9 @@ class _Kernel:
     def compile_s(self) -> float:
         """Roughly how long compiling takes, in seconds."""
         # measured on two cores
-        return 0.0044 * len(self.signatures) * (30 + len(self.function.__code__.co_code) / 10)
+        within = [self, *(callee for callee in self.callees if not callee.signatures)]
+        n_instructions = sum(30 + len(item.function.__code__.co_code) / 10 for item in within)
+        return 0.0044 * len(self.signatures) * n_instructions
 
     def is_in_use(self) -> bool:
         """Whether its module is the imported one, and not one that was edited and imported again since."""
@@ -327,9 +334,14 @@ class _Kernel:
             ]
         return values
 
-    @property
+    @cached_property
     def callees(self) -> list[_Kernel]:
-        return [value for value in self.named.values() if isinstance(value, _Kernel)]
+        """The kernels that it calls, and those that they call."""
+        reached: list[_Kernel] = [self]
+        for item in reached:
+            called = [value for value in item.named.values() if isinstance(value, _Kernel)]
+            reached += [callee for callee in dict.fromkeys(called) if callee not in reached]
+        return reached[1:]
 
     @cached_property
     def source(self) -> str:
@@ -341,10 +353,7 @@ class _Kernel:
     @cached_property
     def digest(self) -> str:
         """Digest of everything that it is compiled from."""
-        reached = [self]
-        for item in reached:
-            reached += [callee for callee in item.callees if callee not in reached]
-        parts = [_environment(), self.source, *sorted(item.source for item in reached)]
+        parts = [_environment(), self.source, *sorted(item.source for item in self.callees)]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
