@@ -23,7 +23,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from labseq_grid.planner import GridPlanner, GridSettings
 from labseq_psca.planner import PscaPlanner, PscaSettings
-from labseq_scans.planners import LineSettings, Mta1Planner, TetrisPlanner
+from labseq_rivals.planners import LineSettings, Mta1Planner, TetrisPlanner
 
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.geometry import pattern

@@ -1,11 +1,25 @@
-"""The parallel sort-and-compression algorithm of Tian et al., for any target on any grid."""
+"""The parallel sort-and-compression algorithm of Tian et al., for any target on any grid, and repair."""
 
-from labseq.plugin import Registry, hookimpl
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from labseq.plugin import Context, Registry, hookimpl
+
+if TYPE_CHECKING:
+    from labseq_psca.repair import RepairPlanner, RepairSettings
 
 LABSEQ_API = 1
 
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the planner ``psca``."""
+    """Offer the planners ``psca`` and ``repair``."""
+
+    def repair(settings: RepairSettings, context: Context) -> RepairPlanner:
+        from labseq_psca.repair import RepairPlanner, construct_other
+
+        return RepairPlanner(settings, context, construct_other(registry, settings.after, context))
+
     registry.planner("psca", "labseq_psca.planner:PscaPlanner", "labseq_psca.planner:PscaSettings")
+    registry.planner("repair", repair, "labseq_psca.repair:RepairSettings")

@@ -2,7 +2,7 @@
 
 Everything is written for row sorting and then column compression; the other
 orientation is the same on the transposed grid. The vocabulary is that of
-:mod:`labseq_psca.kernels_lines` and :mod:`labseq_psca.kernels_rows`.
+:mod:`labseq_psca.kernels_columns` and :mod:`labseq_psca.kernels_rows`.
 """
 
 from __future__ import annotations
@@ -13,21 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import helper_kernel, kernel
-from labseq_psca.kernels_lines import (
-    FINISHED,
-    GRID,
-    GROWING,
-    IMPOSSIBLE,
-    LINE,
-    Bools,
-    Finished,
-    Growing,
-    Ints,
-    compress_columns,
+from labseq.plugin.plan_kernels import (
+    FINISHED_PLAN,
+    FinishedPlan,
+    GrowingPlan,
+    column_sums,
+    count_moves,
     empty_plan,
     finished,
+    unlock_row,
 )
-from labseq_psca.kernels_rows import count_columns, place_in_order, sort_row, unlock_row, weigh_columns
+from labseq_psca.kernels_columns import GRID, IMPOSSIBLE, Bools, Ints, compress_columns
+from labseq_psca.kernels_rows import place_in_order, sort_row, weigh_columns
 
 # What changes are worth, in units of one atom moved, beside those of kernels_rows: README, "Choices".
 ON_TARGET: Final = 10  # more for an atom that lands on a fill site, less for one that leaves it
@@ -38,10 +35,9 @@ PER_BATCH: Final = 1000  # worth per batch is compared in integers, in thousandt
 
 Work = tuple[Ints, NDArray[np.int8], Ints, Ints]
 """int64 (> n_cols,) and int8 (n_cols, > n_cols) for an exchange; int64 (3, n_cols) and (n_rows,)."""
-WORK: Final = "Tuple((int64[::1], int8[:, ::1], int64[:, ::1], int64[::1]))"
 
 
-@helper_kernel(f"void({GRID}, int64[::1], int64[::1], int64, int64, int64[::1])")
+@helper_kernel()
 def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, order: int, rank: Ints) -> None:
     """Bound from above what sorting each row is worth per batch.
 
@@ -68,7 +64,7 @@ def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, order: int, r
             rank[row] = bound * PLACES + PLACES // 2 - place_in_order(n_atoms, n_cols, order)
 
 
-@helper_kernel(f"int64({LINE}, int64[::1], int64[::1], {WORK}, int64[::1])")
+@helper_kernel()
 def best_exchange(atoms: Bools, gain: Ints, cost: Ints, work: Work, change: Ints) -> int:
     """Find the atoms of a row that had best leave their columns, and the vacancies to fill.
 
@@ -133,7 +129,7 @@ def best_exchange(atoms: Bools, gain: Ints, cost: Ints, work: Work, change: Ints
     return int(worth[even])
 
 
-@helper_kernel(f"int64({LINE}, int64[::1])")
+@helper_kernel()
 def n_moved(atoms: Bools, change: Ints) -> int:
     """Count the atoms of a row that an exchange moves."""
     n = balance = 0
@@ -144,7 +140,7 @@ def n_moved(atoms: Bools, change: Ints) -> int:
     return n
 
 
-@helper_kernel(f"int64({GRID}, {GRID}, int64[::1], int64[::1], int64, int64, {WORK}, int64[::1])")
+@helper_kernel()
 def choose_row(
     atoms: Bools, fill: Bools, weight: Ints, leave: Ints, limit: int, order: int, work: Work, change: Ints
 ) -> int:
@@ -183,15 +179,16 @@ def choose_row(
     return best_row
 
 
-@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, {GRID}, int64, int64)")
-def sort_rows(plan: Growing, atoms: Bools, fill: Bools, clear: Bools, limit: int, order: int) -> Growing:
+@helper_kernel()
+def sort_rows(
+    plan: GrowingPlan, atoms: Bools, fill: Bools, clear: Bools, limit: int, order: int
+) -> GrowingPlan:
     """Sort rows until every column holds at least as many atoms as it has fill sites; updates ``atoms``."""
     n_rows, n_cols = atoms.shape
-    need, room, count = count_columns(atoms, fill, clear)
+    need, room, count = column_sums(fill), n_rows - column_sums(clear), column_sums(atoms)
     weight = np.empty(n_cols, np.int64)
     leave = np.empty(n_cols, np.int64)
     change = np.empty(n_cols, np.int64)
-    line = np.empty((2, n_cols), np.int64)
     work = (
         np.empty(n_cols + 1, np.int64),
         np.empty((n_cols, n_cols + 1), np.int8),
@@ -200,17 +197,17 @@ def sort_rows(plan: Growing, atoms: Bools, fill: Bools, clear: Bools, limit: int
     )
     while weigh_columns(need, room, count, weight, leave) > 0:
         row = choose_row(atoms, fill, weight, leave, limit, order, work, change)
-        n_batches = plan[2]
+        n_moves = count_moves(plan)
         if row >= 0:
-            plan = sort_row(plan, atoms, row, change, count, line, limit)
+            plan = sort_row(plan, atoms, row, change, count, limit)
         else:
-            plan = unlock_row(plan, atoms, weight, leave)
-        if plan[2] == n_batches:
+            plan = unlock_row(plan, atoms, count - need)
+        if count_moves(plan) == n_moves:
             break
     return plan
 
 
-@helper_kernel(f"int64({GRID}, {GRID}, {GRID}, int64)")
+@helper_kernel()
 def least_batches(atoms: Bools, fill: Bools, clear: Bools, limit: int) -> int:
     """Count the batches that the compression of all columns takes at least, after row sorting."""
     n_rows, n_cols = atoms.shape
@@ -226,7 +223,7 @@ def least_batches(atoms: Bools, fill: Bools, clear: Bools, limit: int) -> int:
     return n
 
 
-@helper_kernel(f"boolean[:, ::1]({GRID})")
+@helper_kernel()
 def transposed(sites: Bools) -> Bools:
     """Swap rows and columns, into a contiguous array."""
     n_rows, n_cols = sites.shape
@@ -237,20 +234,27 @@ def transposed(sites: Bools) -> Bools:
     return swapped
 
 
-@helper_kernel(f"UniTuple(int64, 3)({GROWING})")
-def costs(plan: Growing) -> tuple[int, int, int]:
+@helper_kernel()
+def costs(plan: GrowingPlan) -> tuple[int, int, int]:
     """Number of batches, number of atom moves, and total distance in sites."""
-    moves, offsets, n_batches = plan
-    n_moves, distance = int(offsets[n_batches]), 0
+    moves, _, _, n_batches = plan
+    n_moves, distance = count_moves(plan), 0
     for i in range(n_moves):
         distance += int(abs(moves[i, 2] - moves[i, 0])) + int(abs(moves[i, 3] - moves[i, 1]))
     return n_batches, n_moves, distance
 
 
-@kernel(f"{FINISHED}({GRID}, {GRID}, {GRID}, int64, int64, int64, int64)")
+@helper_kernel()
+def finished_swapped(plan: GrowingPlan) -> FinishedPlan:
+    """Cut a plan of the transposed grid to its batches, and swap its rows and columns back."""
+    moves, offsets, linked = finished(plan)
+    return moves[:, np.array([1, 0, 3, 2])].copy(), offsets, linked
+
+
+@kernel(f"{FINISHED_PLAN}({GRID}, {GRID}, {GRID}, int64, int64, int64, int64)")
 def plan_fewest(
     occupied: Bools, fill: Bools, clear: Bools, row_limit: int, column_limit: int, slots: int, order: int
-) -> Finished:
+) -> FinishedPlan:
     """Plan both orientations and keep the plan of fewer batches, then atom moves, then distance.
 
     The orientation that promises fewer batches after sorting is completed first; the
@@ -265,19 +269,20 @@ def plan_fewest(
         slots: Ejection slots on each side.
         order: Which of equal rows goes first: HALF_FILLED, FULLEST or EMPTIEST.
     """
-    atoms, other_atoms = occupied.copy(), transposed(occupied)
-    other_fill, other_clear = transposed(fill), transposed(clear)
-    plan = sort_rows(empty_plan(atoms.size), atoms, fill, clear, row_limit, order)
-    other = sort_rows(empty_plan(atoms.size), other_atoms, other_fill, other_clear, column_limit, order)
-    least = plan[2] + least_batches(atoms, fill, clear, column_limit)
-    other_least = other[2] + least_batches(other_atoms, other_fill, other_clear, row_limit)
+    # copies of what is only read, for both orientations to be compiled as one
+    atoms, fill, clear = occupied.copy(), fill.copy(), clear.copy()
+    other_atoms, other_fill, other_clear = transposed(occupied), transposed(fill), transposed(clear)
+    plan = sort_rows(empty_plan(2 * atoms.size), atoms, fill, clear, row_limit, order)
+    other = sort_rows(empty_plan(2 * atoms.size), other_atoms, other_fill, other_clear, column_limit, order)
+    least = plan[3] + least_batches(atoms, fill, clear, column_limit)
+    other_least = other[3] + least_batches(other_atoms, other_fill, other_clear, row_limit)
     if least <= other_least:
         plan = compress_columns(plan, atoms, fill, clear, column_limit, slots)
-        if plan[2] < other_least:
-            return finished(plan, False)
+        if plan[3] < other_least:
+            return finished(plan)
     other = compress_columns(other, other_atoms, other_fill, other_clear, row_limit, slots)
     if least > other_least:
-        if other[2] < least:
-            return finished(other, True)
+        if other[3] < least:
+            return finished_swapped(other)
         plan = compress_columns(plan, atoms, fill, clear, column_limit, slots)
-    return finished(plan, False) if costs(plan) <= costs(other) else finished(other, True)
+    return finished(plan) if costs(plan) <= costs(other) else finished_swapped(other)

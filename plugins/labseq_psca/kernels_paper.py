@@ -1,6 +1,6 @@
 """Kernels of the variant as in the paper's text: each row is sorted once, for the columns most in need.
 
-The vocabulary is that of :mod:`labseq_psca.kernels_lines` and :mod:`labseq_psca.kernels_rows`.
+The vocabulary is that of :mod:`labseq_psca.kernels_columns` and :mod:`labseq_psca.kernels_rows`.
 """
 
 from __future__ import annotations
@@ -8,22 +8,21 @@ from __future__ import annotations
 import numpy as np
 
 from labseq.plugin import helper_kernel, kernel
-from labseq_psca.kernels_lines import (
-    FINISHED,
-    GRID,
-    GROWING,
-    Bools,
-    Finished,
-    Growing,
-    Ints,
-    compress_columns,
+from labseq.plugin.plan_kernels import (
+    FINISHED_PLAN,
+    FinishedPlan,
+    GrowingPlan,
+    column_sums,
+    count_moves,
     empty_plan,
     finished,
+    unlock_row,
 )
-from labseq_psca.kernels_rows import count_columns, place_in_order, sort_row, unlock_row, weigh_columns
+from labseq_psca.kernels_columns import GRID, Bools, Ints, compress_columns
+from labseq_psca.kernels_rows import place_in_order, sort_row
 
 
-@helper_kernel("int64[::1](bool_[:, ::1], int64)")
+@helper_kernel()
 def order_of_rows(atoms: Bools, order: int) -> Ints:
     """The rows in the order in which they are sorted; of equal ones the upper first."""
     n_rows, n_cols = atoms.shape
@@ -42,7 +41,7 @@ def order_of_rows(atoms: Bools, order: int) -> Ints:
     return rows
 
 
-@helper_kernel("int64(bool_[::1], int64[::1], int64[::1], int64[::1])")
+@helper_kernel()
 def exchange_for_need(row: Bools, need: Ints, count: Ints, change: Ints) -> int:
     """Give atoms of a row to the columns that lack most, from the columns that have most to spare.
 
@@ -75,39 +74,35 @@ def exchange_for_need(row: Bools, need: Ints, count: Ints, change: Ints) -> int:
         n += 1
 
 
-@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, {GRID}, int64, int64)")
-def sort_rows(plan: Growing, atoms: Bools, fill: Bools, clear: Bools, limit: int, order: int) -> Growing:
+@helper_kernel()
+def sort_rows(plan: GrowingPlan, atoms: Bools, fill: Bools, limit: int, order: int) -> GrowingPlan:
     """Sort each row once, then those again that can still help, until every column has enough.
 
     Where no row can help a column that lacks atoms, an atom moves within another column first.
     Updates ``atoms``.
     """
-    n_cols = atoms.shape[1]
-    need, room, count = count_columns(atoms, fill, clear)
-    weight = np.empty(n_cols, np.int64)
-    leave = np.empty(n_cols, np.int64)
-    change = np.empty(n_cols, np.int64)
-    line = np.empty((2, n_cols), np.int64)
-    while weigh_columns(need, room, count, weight, leave) > 0:
-        n_batches = plan[2]
+    need, count = column_sums(fill), column_sums(atoms)
+    change = np.empty(len(need), np.int64)
+    while (count < need).any():
+        n_moves = count_moves(plan)
         for row in order_of_rows(atoms, order):
             if exchange_for_need(atoms[row], need, count, change) > 0:
-                plan = sort_row(plan, atoms, row, change, count, line, limit)
-        if plan[2] == n_batches:
-            plan = unlock_row(plan, atoms, weight, leave)
-        if plan[2] == n_batches:
+                plan = sort_row(plan, atoms, row, change, count, limit)
+        if count_moves(plan) == n_moves:
+            plan = unlock_row(plan, atoms, count - need)
+        if count_moves(plan) == n_moves:
             break
     return plan
 
 
-@kernel(f"{FINISHED}({GRID}, {GRID}, {GRID}, int64, int64, int64, int64)")
+@kernel(f"{FINISHED_PLAN}({GRID}, {GRID}, {GRID}, int64, int64, int64, int64)")
 def plan_as_in_paper(
     occupied: Bools, fill: Bools, clear: Bools, row_limit: int, column_limit: int, slots: int, order: int
-) -> Finished:
+) -> FinishedPlan:
     """Plan row sorting and column compression.
 
     Arguments as for :func:`labseq_psca.kernels_fewest.plan_fewest`.
     """
     atoms = occupied.copy()
-    plan = sort_rows(empty_plan(atoms.size), atoms, fill, clear, row_limit, order)
-    return finished(compress_columns(plan, atoms, fill, clear, column_limit, slots), False)
+    plan = sort_rows(empty_plan(2 * atoms.size), atoms, fill, row_limit, order)
+    return finished(compress_columns(plan, atoms, fill, clear, column_limit, slots))

@@ -4,8 +4,10 @@ Costs are expected losses of atoms: ``costs`` are those of an atom that is moved
 a batch, and of one site of way. A defect is filled by a *chain*, a path over sites from the defect
 to a surplus atom, with any turns: each atom on it moves along it to the place of the one before, the
 first to the defect. A chain of one atom is a direct move, straight or as an L. Several defects of
-one line may be filled by one *shift* along it. The vocabulary is that of
-:mod:`labseq_psca.kernels_lines`.
+one line may be filled by one *shift* along it.
+
+In all kernels ``atoms`` marks the sites that hold an atom, ``fill`` those that must hold one and ``clear``
+those that must be empty: bool (n_rows, n_cols). ``limit`` is the maximum number of atoms in a batch.
 """
 
 from __future__ import annotations
@@ -16,30 +18,26 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import helper_kernel, kernel
-from labseq_psca.kernels_lines import (
-    GRID,
-    GROWING,
-    Bools,
-    Growing,
-    Ints,
-    Moves,
-    Offsets,
+from labseq.plugin import const, helper_kernel, kernel
+from labseq.plugin.plan_kernels import (
+    FINISHED_PLAN,
+    FinishedPlan,
+    GrowingPlan,
     add_line,
-    add_move,
     empty_plan,
     finished,
+    move_alone,
 )
 
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+GRID: Final = const("bool_", 2)
 Costs = tuple[float, float, float]
-COSTS: Final = "UniTuple(float64, 3)"
-Linked = NDArray[np.bool_]
 Shift = tuple[int, int, int, int, int]
 """Row and column of a defect, the step to where its atoms come from, and the sites to the last of them."""
-SHIFT: Final = "UniTuple(int64, 5)"
 
 
-@helper_kernel(f"Tuple((float64, int64, int64))(bool_[:, ::1], {GRID}, int64, int64, int64, int64, {COSTS})")
+@helper_kernel()
 def shift_to(
     atoms: Bools, fill: Bools, row: int, col: int, down: int, right: int, costs: Costs
 ) -> tuple[float, int, int]:
@@ -74,7 +72,7 @@ def shift_to(
     return best_cost, best_defects, best_sites
 
 
-@helper_kernel(f"Tuple((float64, int64, {SHIFT}))(bool_[:, ::1], {GRID}, int64, int64, {COSTS})")
+@helper_kernel()
 def cheapest_shift(atoms: Bools, fill: Bools, row: int, col: int, costs: Costs) -> tuple[float, int, Shift]:
     """Find the shift that costs least for each defect that it fills; 0 defects if there is none."""
     best = (row, col, 0, 0, 0)
@@ -89,7 +87,7 @@ def cheapest_shift(atoms: Bools, fill: Bools, row: int, col: int, costs: Costs) 
     return best_cost, best_defects, best
 
 
-@helper_kernel(f"Tuple((float64, int64[:, ::1]))(bool_[:, ::1], {GRID}, {GRID}, int64, int64, {COSTS})")
+@helper_kernel()
 def cheapest_chain(
     atoms: Bools, fill: Bools, clear: Bools, row: int, col: int, costs: Costs
 ) -> tuple[float, Ints]:
@@ -153,10 +151,10 @@ def cheapest_chain(
     return total, sites
 
 
-@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64[::1], int64[::1], int64, int64, boolean, int64)")
+@helper_kernel()
 def add_run(
-    plan: Growing, atoms: Bools, source: Ints, goal: Ints, row: int, col: int, is_row: bool, limit: int
-) -> Growing:
+    plan: GrowingPlan, atoms: Bools, source: Ints, goal: Ints, row: int, col: int, is_row: bool, limit: int
+) -> GrowingPlan:
     """Move atoms of one line from ``source`` to ``goal``, both ascending; updates ``atoms``."""
     for i in range(len(source)):
         if is_row:
@@ -168,12 +166,12 @@ def add_run(
             atoms[row, goal[i]] = True
         else:
             atoms[goal[i], col] = True
-    n_sites = atoms.shape[1] if is_row else atoms.shape[0]
-    return add_line(plan, source, goal, n_sites, row if is_row else col, is_row, limit, 0)
+    line = (True, row, atoms.shape[1]) if is_row else (False, col, atoms.shape[0])
+    return add_line(plan, line, source, goal, limit, 0)
 
 
-@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, {SHIFT}, int64)")
-def add_shift(plan: Growing, atoms: Bools, fill: Bools, shift: Shift, limit: int) -> Growing:
+@helper_kernel()
+def add_shift(plan: GrowingPlan, atoms: Bools, fill: Bools, shift: Shift, limit: int) -> GrowingPlan:
     """Add the batches of a shift; updates ``atoms``."""
     row, col, down, right, n_sites = shift
     source, goal = np.empty(n_sites + 1, np.int64), np.empty(n_sites + 1, np.int64)
@@ -194,20 +192,22 @@ def add_shift(plan: Growing, atoms: Bools, fill: Bools, shift: Shift, limit: int
     return add_run(plan, atoms, source[:n_atoms], goal[first : first + n_atoms], row, col, down == 0, limit)
 
 
-@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64[:, ::1], int64, int64, bool_[::1])")
-def add_bent(plan: Growing, atoms: Bools, sites: Ints, start: int, stop: int, linked: Linked) -> Growing:
+@helper_kernel()
+def add_bent(plan: GrowingPlan, atoms: Bools, sites: Ints, start: int, stop: int) -> GrowingPlan:
     """Move the atom on ``sites[start]`` along a chain to ``sites[stop]``, its tweezer on at each turn."""
     corner = start
     for i in range(start - 1, stop - 1, -1):
         turns = i > stop and sites[i - 1, 0] != sites[i + 1, 0] and sites[i - 1, 1] != sites[i + 1, 1]
         if i == stop or turns:
-            linked[plan[2]] = corner != start
-            plan = add_move(plan, atoms, sites[corner, 0], sites[corner, 1], sites[i, 0], sites[i, 1])
+            goes_on = corner != start
+            plan = move_alone(
+                plan, atoms, sites[corner, 0], sites[corner, 1], sites[i, 0], sites[i, 1], goes_on
+            )
             corner = i
     return plan
 
 
-@helper_kernel("boolean(int64[:, ::1], int64, int64)")
+@helper_kernel()
 def is_straight(sites: Ints, start: int, stop: int) -> bool:
     """Whether a part of a chain has no turn."""
     way = abs(sites[stop, 0] - sites[start, 0]) + abs(sites[stop, 1] - sites[start, 1])
@@ -215,11 +215,9 @@ def is_straight(sites: Ints, start: int, stop: int) -> bool:
     return in_line and way == stop - start
 
 
-@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], int64[:, ::1], int64, int64, bool_[::1])")
-def add_chain(
-    plan: Growing, atoms: Bools, sites: Ints, row_limit: int, column_limit: int, linked: Linked
-) -> Growing:
-    """Add the batches of a chain, the atom next to the defect first; updates ``atoms`` and ``linked``."""
+@helper_kernel()
+def add_chain(plan: GrowingPlan, atoms: Bools, sites: Ints, row_limit: int, column_limit: int) -> GrowingPlan:
+    """Add the batches of a chain, the atom next to the defect first; updates ``atoms``."""
     n_sites = len(sites)
     at = np.empty(n_sites + 1, np.int64)  # where on the chain the defect and the atoms are
     at[0] = 0
@@ -243,7 +241,7 @@ def add_chain(
         ):
             last += 1
         if last == first + 1:
-            plan = add_bent(plan, atoms, sites, at[last], at[first], linked)
+            plan = add_bent(plan, atoms, sites, at[last], at[first])
             first = last
             continue
         n = last - first - 1
@@ -258,12 +256,11 @@ def add_chain(
 
 
 @kernel(
-    f"Tuple((int16[:, ::1], int32[::1], bool_[::1], bool_[:, ::1]))"
-    f"({GRID}, {GRID}, {GRID}, int64, int64, {COSTS})"
+    f"Tuple(({FINISHED_PLAN}, bool_[:, ::1]))({GRID}, {GRID}, {GRID}, int64, int64, UniTuple(float64, 3))"
 )
 def plan_repair(
     occupied: Bools, fill: Bools, clear: Bools, row_limit: int, column_limit: int, costs: Costs
-) -> tuple[Moves, Offsets, Linked, Bools]:
+) -> tuple[FinishedPlan, Bools]:
     """Fill defects by chains and shifts, those first that cost most.
 
     A chain may so pass through the defects that are nearer to its surplus atom, which saves it the atoms
@@ -278,15 +275,13 @@ def plan_repair(
         costs: See the module.
 
     Returns:
-        moves, int16 (n_moves, 4), batch offsets, int32 (n_batches + 1,), which batches are linked to the
-        one before, bool (n_batches,), and the occupancy after them. Defects that no chain reaches are left.
+        The plan, and the occupancy after it. Defects that no chain reaches are left.
     """
     atoms = occupied.copy()
     plan = empty_plan(atoms.size)
     n_rows, n_cols = atoms.shape
-    linked = np.zeros(4 * atoms.size, np.bool_)
     left = fill & ~atoms
-    while plan[2] + atoms.size <= len(linked):  # a chain has fewer batches than there are sites
+    while plan[3] <= 3 * atoms.size:
         row = col = -1
         highest = -1.0
         for r in range(n_rows):
@@ -303,8 +298,7 @@ def plan_repair(
         if n_defects > 1 and cost < chain_cost * n_defects:
             plan = add_shift(plan, atoms, fill, shift, column_limit if shift[2] != 0 else row_limit)
         elif len(sites) > 0:
-            plan = add_chain(plan, atoms, sites, row_limit, column_limit, linked)
+            plan = add_chain(plan, atoms, sites, row_limit, column_limit)
         left[row, col] = False
         left &= ~atoms
-    moves, offsets = finished(plan, False)
-    return moves, offsets, linked[: plan[2]].copy(), atoms
+    return finished(plan), atoms

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import importlib
-import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
-from labseq.plugin import Context, Occupancy, Plan, PlanError, Settings, SiteGrid, TargetPattern, as_occupancy
+from labseq.plugin import Context, Occupancy, Plan, PlanError, Settings, TargetPattern, as_occupancy
 from labseq.plugin.geometry import nearest_to_centre
-from labseq.plugin.planning import choose_plan
+from labseq.plugin.plan_kernels import FinishedPlan, as_plan
+from labseq_psca.repair import Repair
 
-Kernel = Callable[..., tuple[NDArray[np.int16], NDArray[np.int32]]]
+Kernel = Callable[..., FinishedPlan]
 RowOrder = Literal["half_filled", "fullest", "emptiest"]
 
 
@@ -88,12 +87,13 @@ class PscaPlanner:
             min(dop, motion.max_row_tones, tones.row or dop),  # along a column
         )
         self._settings = settings
-        self._repair_below = settings.repair_below if settings.variant == "fewest" else 0.0
         self._eject_slots = motion.eject_slots
         # as in kernels_rows, which is not imported here: it takes numba
         self._order = {"half_filled": 0, "fullest": -1, "emptiest": 1}[settings.row_order]
         self._grid = context.grid
-        self._motion = motion
+        self._repair: Repair | None = None
+        if settings.variant == "fewest" and settings.repair_below > 0:
+            self._repair = Repair(settings.repair_below, self._limits, dop, context)
 
     @cached_property
     def _kernel(self) -> Kernel:
@@ -106,8 +106,8 @@ class PscaPlanner:
     def warm(self) -> None:
         """Compile the kernels, or load them from the cache."""
         _ = self._kernel
-        if self._repair_below > 0:
-            importlib.import_module("labseq_psca.kernels_repair")
+        if self._repair is not None:
+            self._repair.warm()
 
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
         """Plan the moves that fill the target and clear what must be empty.
@@ -128,50 +128,15 @@ class PscaPlanner:
                 target's shape.
         """
         try:
-            occupied = as_occupancy(occupancy, target.shape)
+            atoms = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), "psca") from error
-        fill = nearest_to_centre(target.fill, int(np.count_nonzero(occupied)), self._grid)
-        plan = _plan(*self._sort_and_compress(occupied, fill, target.clear))
-        if self._repair_below > 0:
-            n_defects = int(np.count_nonzero(fill > occupied))
-            if 0 < n_defects <= self._repair_below * target.n_atoms:
-                plans = (plan, self._repair(occupied, fill, target))
-                grid, dop = self._grid, self.degree_of_parallelism
-                if grid.shape != target.shape:  # a planner may be called for another array than the profile's
-                    grid = SiteGrid(*target.shape, grid.spacing_m, lattice=grid.lattice, shear=grid.shear)
-                return choose_plan(plans, occupied, target, dop, grid, self._motion)
-        return plan
+        plan = self._sort_and_compress(atoms, target)
+        if self._repair is None:
+            return plan
+        return self._repair.improve(plan, atoms, target, lambda after: self._sort_and_compress(after, target))
 
-    def _sort_and_compress(
-        self, occupied: Occupancy, fill: NDArray[np.bool_], clear: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.int16], NDArray[np.int32]]:
-        return self._kernel(occupied, fill, clear, *self._limits, self._eject_slots, self._order)
-
-    def _repair(self, occupied: Occupancy, fill: NDArray[np.bool_], target: TargetPattern) -> Plan:
-        """Fill each defect in the way that is expected to lose fewest atoms; then sort and compress."""
-        from labseq_psca.kernels_repair import plan_repair
-
-        motion, spacing_m = self._motion, self._grid.spacing_m
-        losses = motion.losses
-        per_second = target.n_atoms / losses.lifetime_s  # of all atoms, which wait while some move
-        batch_s = motion.overhead_per_batch_s + motion.pick_up_s + motion.drop_off_s
-        costs = (
-            -math.log1p(-losses.move),
-            per_second * batch_s,
-            spacing_m * (per_second / motion.speed_m_s + losses.distance_per_m),
-        )
-        moves, offsets, linked, atoms = plan_repair(occupied, fill, target.clear, *self._limits, costs)
-        more_moves, more_offsets = self._sort_and_compress(atoms, fill, target.clear)
-        return _plan(
-            np.concatenate([moves, more_moves]),
-            np.concatenate([offsets, more_offsets[1:] + offsets[-1]]),
-            np.concatenate([linked, np.zeros(len(more_offsets) - 1, np.bool_)]),
-        )
-
-
-def _plan(*arrays: NDArray[Any]) -> Plan:
-    """A plan of arrays that nothing else holds."""
-    for array in arrays:
-        array.flags.writeable = False  # otherwise Plan would copy them
-    return Plan(*arrays)
+    def _sort_and_compress(self, atoms: Occupancy, target: TargetPattern) -> Plan:
+        fill = nearest_to_centre(target.fill, int(np.count_nonzero(atoms)), self._grid)
+        limits = *self._limits, self._eject_slots, self._order
+        return as_plan(self._kernel(atoms, fill, target.clear, *limits))

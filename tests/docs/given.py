@@ -195,7 +195,8 @@ GIVEN: Final[dict[str, Callable[[Path], Given]]] = {
     "docs/how-to/resume-a-run.md": _stopped,
     "docs/how-to/serial-devices.md": _serial,
     "docs/how-to/cameras-andor.md": _andor,
-    "plugins/labseq_scans/README.md": lambda to: Given({"n_loadings=500": "n_loadings=2"}),
-    "plugins/labseq_single/README.md": lambda to: Given({"(500, 20, 20)": "(2, 20, 20)"}),
+    "docs/explanation/rivals.md": lambda to: Given(
+        {"n_loadings=500": "n_loadings=2", "(500, 20, 20)": "(2, 20, 20)"}
+    ),
 }
 """Page -> prepares its folder."""

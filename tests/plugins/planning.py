@@ -8,8 +8,16 @@ from typing import Any
 import numpy as np
 from labseq_grid.planner import GridPlanner, GridSettings
 from labseq_psca.planner import PscaPlanner, PscaSettings
-from labseq_scans.planners import LineSettings, Mta1Planner, TetrisPlanner
-from labseq_single.planner import CompressionPlanner, HcaPlanner, LsapPlanner, LsapSquaredPlanner
+from labseq_psca.repair import RepairPlanner, RepairSettings
+from labseq_rivals.planners import (
+    CompressionPlanner,
+    HcaPlanner,
+    LineSettings,
+    LsapPlanner,
+    LsapSquaredPlanner,
+    Mta1Planner,
+    TetrisPlanner,
+)
 from numpy.typing import NDArray
 
 from labseq.plugin import Context, MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
@@ -28,6 +36,10 @@ def grid(context: Context, dop: int) -> GridPlanner:
     return GridPlanner(GridSettings(degree_of_parallelism=dop), context)
 
 
+def repair(make: MakePlanner) -> MakePlanner:
+    return lambda context, dop: RepairPlanner(RepairSettings(below=1), context, make(context, dop))
+
+
 def mta1(context: Context, dop: int) -> Mta1Planner:
     return Mta1Planner(LineSettings(degree_of_parallelism=dop), context)
 
@@ -42,8 +54,19 @@ def single(planner: type[Any]) -> MakePlanner:
 
 SINGLE = {cls.name: single(cls) for cls in (LsapPlanner, LsapSquaredPlanner, CompressionPlanner, HcaPlanner)}
 """Planners with one mobile tweezer: name -> how to make them."""
-PLANNERS: dict[str, MakePlanner] = {"psca": psca(), "grid": grid, "mta1": mta1, "tetris": tetris, **SINGLE}
-VARIANTS = {"psca, as in the paper": psca(variant="paper"), "psca, repair": psca(repair_below=1)}
+PLANNERS: dict[str, MakePlanner] = {
+    "psca": psca(),
+    "repair": repair(tetris),
+    "grid": grid,
+    "mta1": mta1,
+    "tetris": tetris,
+    **SINGLE,
+}
+VARIANTS = {
+    "psca, as in the paper": psca(variant="paper"),
+    "psca, repair": psca(repair_below=1),
+    "repair, after grid": repair(grid),
+}
 
 
 def plan_and_check(

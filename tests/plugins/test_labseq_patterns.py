@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import labseq_patterns
-import labseq_scans
+import labseq_rivals
 import numpy as np
 import pytest
 from labseq_patterns import patterns
 from labseq_patterns.patterns import BlockSettings, RingSettings, SierpinskiSettings
-from labseq_scans.pattern import InterleavedSettings, interleaved
+from labseq_rivals.interleaved import InterleavedSettings, interleaved
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
@@ -53,7 +53,7 @@ class TestPatterns(PatternContract):
 
 def test_every_pattern_is_tested() -> None:
     registry = Registry()
-    modules: tuple[Any, ...] = (labseq.builtin, labseq_patterns, labseq_scans)
+    modules: tuple[Any, ...] = (labseq.builtin, labseq_patterns, labseq_rivals)
     for module in modules:
         module.labseq_register(registry)
     assert {*registry.names("pattern")} == {*MADE}

@@ -8,11 +8,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import labseq_psca
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
-from labseq_psca import kernels_fewest, kernels_lines, kernels_repair
+from labseq_psca import kernels_columns, kernels_fewest, kernels_repair
 from labseq_psca.planner import PscaPlanner, PscaSettings, ToneLimits
+from labseq_psca.repair import RepairPlanner, RepairSettings
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
@@ -20,7 +22,8 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 from labseq import Occupancy, SiteGrid, TargetPattern, check_plan, make_target
 from labseq.model import LossSpec
 from labseq.motion import predict_survival
-from labseq.plugin import Context, MotionSpec, Plan
+from labseq.plugin import ConfigError, Context, MotionSpec, Plan, Registry
+from labseq.plugin.plan_kernels import empty_plan
 from labseq.testing.strategies import cases
 
 from .planning import COMPACT, loadings, plan_and_check, psca
@@ -234,9 +237,9 @@ def plans_of_both_ways(
     along, across = planner._limits
     for grids in ((atoms, target.fill, target.clear), (atoms.T, target.fill.T, target.clear.T)):
         after, fill, clear = (np.array(grid, order="C") for grid in grids)
-        plan = kernels_fewest.sort_rows(kernels_lines.empty_plan(after.size), after, fill, clear, along, 0)
-        bound = plan[2] + kernels_fewest.least_batches(after, fill, clear, across)
-        plan = kernels_lines.compress_columns(plan, after, fill, clear, across, planner._eject_slots)
+        plan = kernels_fewest.sort_rows(empty_plan(after.size), after, fill, clear, along, 0)
+        bound = plan[3] + kernels_fewest.least_batches(after, fill, clear, across)
+        plan = kernels_columns.compress_columns(plan, after, fill, clear, across, planner._eject_slots)
         found.append((kernels_fewest.costs(plan), bound))
         along, across = across, along
     return found
@@ -274,6 +277,38 @@ def test_repair_is_chosen_by_expected_survival() -> None:
             assert chances[0] >= chances[1]
             n_moves[-1] += n_picked_up(plans[0])
     assert n_moves[0] < 0.9 * n_moves[1]
+
+
+def test_repair_after_another_planner_is_that_of_psca() -> None:
+    rng = np.random.default_rng(3)
+    after = RepairPlanner(RepairSettings(), Context(), PscaPlanner(PscaSettings(repair_below=0), Context()))
+    within = PscaPlanner(PscaSettings(), Context())
+    for n_lost in (0.02, 0.3):
+        seen = rng.random((20, 20)) > np.where(COMPACT.fill, n_lost, 0.5)
+        assert after.plan(seen, COMPACT).is_same(within.plan(seen, COMPACT))
+
+
+@pytest.mark.parametrize(
+    ("after", "text"),
+    [
+        ({"use": "tetris"}, "'tetris'; expected one of psca$"),
+        ({"use": "repair"}, "'repair'; expected one of psca$"),
+        ({"degree_of_parallelism": 7}, "None; expected one of psca$"),
+        ({"use": "psca", "row_order": "random"}, r"after\.row_order: .*half_filled"),
+        (
+            {"use": "psca", "rows": "half_filled"},
+            r"after\.rows: .*the settings of .psca. are",
+        ),
+    ],
+)
+def test_a_planner_that_repair_cannot_follow_is_refused(after: dict[str, Any], text: str) -> None:
+    registry = Registry()
+    plugin: Any = labseq_psca
+    plugin.labseq_register(registry)
+    entry: Any = registry.get("planner", "repair")
+    with pytest.raises(ConfigError, match=text):
+        entry.factory(RepairSettings(after=after), Context())
+    assert entry.factory(RepairSettings(), Context()).degree_of_parallelism == 7
 
 
 def test_a_repair_costs_the_time_that_the_check_predicts(monkeypatch: pytest.MonkeyPatch) -> None:

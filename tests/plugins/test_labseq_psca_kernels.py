@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 from hypothesis import assume, given, settings, strategies as st
-from labseq_psca import kernels_fewest, kernels_lines, kernels_rows
+from labseq_psca import kernels_columns, kernels_fewest, kernels_rows
 from numpy.typing import NDArray
+
+from labseq.plugin.plan_kernels import empty_plan, finished
 
 Sites = list[int]
 
@@ -40,7 +42,9 @@ class TestCompress:
         goal = np.zeros(n, np.int64)
         cost, step = np.zeros((n, 2 * n + 1), np.int64), np.zeros((n, 2 * n + 1), np.int16)
         goal = goal[: len(source)]
-        assert kernels_lines.compress(ints(source), bools(fill), bools(clear), limit, slots, cost, step, goal)
+        assert kernels_columns.compress(
+            ints(source), bools(fill), bools(clear), limit, slots, cost, step, goal
+        )
         return goal.tolist()
 
     @staticmethod
@@ -82,46 +86,7 @@ class TestCompress:
     def test_too_few_atoms_for_the_fill_sites(self) -> None:
         cost, step = np.zeros((2, 5), np.int64), np.zeros((2, 5), np.int16)
         fill, clear = bools([True, True]), bools([False, False])
-        assert not kernels_lines.compress(ints([0]), fill, clear, 1, 1, cost, step, ints([0]))
-
-
-class TestFillBatch:
-    """Which atoms of a line go together."""
-
-    @given(st.data())
-    @settings(max_examples=100, deadline=None)
-    def test_the_way_is_free_and_no_batch_is_wasted(self, data: st.DataObject) -> None:
-        n = data.draw(st.integers(1, 8), "sites")
-        source = sorted(data.draw(st.sets(st.integers(0, n - 1), min_size=1), "atoms"))
-        reach = st.sets(st.integers(-2, n + 1), min_size=len(source), max_size=len(source))
-        goal = sorted(data.draw(reach, "goals"))
-        limit, slots = data.draw(st.integers(1, 4), "limit"), data.draw(st.integers(1, 2), "slots")
-        moving = [(a, b) for a, b in zip(source, goal, strict=True) if a != b]
-        staying = {a for a, b in zip(source, goal, strict=True) if a == b}
-        source, goal = [a for a, _ in moving], [b for _, b in moving]
-        turn = ints([0] * len(moving))
-        place = dict(enumerate(source))
-        batch = 0
-        while 0 in turn:
-            batch += 1
-            chosen = kernels_lines.fill_batch(ints(source), ints(goal), n, limit, slots, turn, batch)
-            going = [i for i in place if turn[i] == batch]
-            assert 0 < len(going) == chosen <= limit
-            assert sum(goal[i] < 0 for i in going) <= slots
-            assert sum(goal[i] >= n for i in going) <= slots
-            for i, other in product(going, place):
-                if other not in going:  # it stands
-                    assert not min(place[i], goal[i]) <= place[other] <= max(place[i], goal[i])
-            for i, site in product(going, staying):
-                assert not min(place[i], goal[i]) <= site <= max(place[i], goal[i])
-            for i in going:
-                place[i] = goal[i]
-                if not 0 <= goal[i] < n:
-                    del place[i]
-        n_ejected = max(sum(site < 0 for site in goal), sum(site >= n for site in goal))
-        n_moved = sum(a != b for a, b in zip(source, goal, strict=True))
-        if n_ejected == 0:
-            assert batch == -(-n_moved // limit)
+        assert not kernels_columns.compress(ints([0]), fill, clear, 1, 1, cost, step, ints([0]))
 
 
 class TestBestExchange:
@@ -159,9 +124,8 @@ class TestBestExchange:
         row, count = bools([atoms]), np.zeros(n, np.int64)
         before = np.flatnonzero(row)
         n_moved = kernels_fewest.n_moved(row[0], change)
-        lines = np.zeros((2, n), np.int64)
-        plan = kernels_rows.sort_row(kernels_lines.empty_plan(n), row, 0, change, count, lines, n)
+        plan = finished(kernels_rows.sort_row(empty_plan(n), row, 0, change, count, n))
         moves = [[0, a, 0, b] for a, b in zip(before, np.flatnonzero(row), strict=True) if a != b]
-        assert sorted(plan[0][: plan[1][plan[2]]].tolist()) == moves
+        assert sorted(plan[0].tolist()) == moves
         assert n_moved == len(moves)
         assert count.tolist() == change.tolist()

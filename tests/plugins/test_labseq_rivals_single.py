@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from labseq_single.planner import travel
+from labseq_rivals.planners import travel
 from scipy.optimize import linear_sum_assignment
 
 from labseq.plugin import Occupancy, Plan, TargetPattern

@@ -6,31 +6,27 @@ where they go; ``n_atoms``, int64 (n_cols,), is the number of atoms of each colu
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
 from labseq.plugin import helper_kernel, kernel
-from labseq_scans.kernels_lines import (
-    GRID,
-    GROWING,
-    Bools,
-    Growing,
-    Ints,
+from labseq.plugin.plan_kernels import (
+    FINISHED_PLAN,
+    FinishedPlan,
+    GrowingPlan,
     add_move,
     column_sums,
+    count_moves,
     empty_plan,
     end_batch,
-    settle,
-    supply_columns,
+    finished,
 )
+from labseq_rivals.kernels_lines import GRID, Bools, Ints, settle, supply_columns
 
 Scans = tuple[Ints, int]
 """How many lines each scan passes, and the number of scans."""
-SCANS: Final = "Tuple((int64[::1], int64))"
 
 
-@helper_kernel(f"{SCANS}({SCANS}, int64)")
+@helper_kernel()
 def add_scan(scans: Scans, n_lines: int) -> Scans:
     """Add a scan that passes ``n_lines``."""
     passed, n_scans = scans
@@ -42,7 +38,7 @@ def add_scan(scans: Scans, n_lines: int) -> Scans:
     return passed, n_scans + 1
 
 
-@helper_kernel(f"void({GRID}, int64, int64, int64[::1])")
+@helper_kernel()
 def look_aside(atoms: Bools, col: int, side: int, distance: Ints) -> None:
     """Measure how far the nearest atom beside each vacancy of a column is.
 
@@ -62,7 +58,7 @@ def look_aside(atoms: Bools, col: int, side: int, distance: Ints) -> None:
             other += side
 
 
-@helper_kernel("int64(int64[::1], bool_[::1], int64)")
+@helper_kernel()
 def choose_nearest(distance: Ints, chosen: Bools, n_wanted: int) -> int:
     """Mark the rows with the least distances above 0, ``n_wanted`` at most; return the largest of them."""
     farthest = 0
@@ -78,11 +74,9 @@ def choose_nearest(distance: Ints, chosen: Bools, n_wanted: int) -> int:
     return farthest
 
 
-@helper_kernel(
-    f"{GROWING}({GROWING}, bool_[:, ::1], int64[::1], int64, int64, int64[::1], bool_[::1], int64)"
-)
+@helper_kernel()
 def fetch(
-    plan: Growing,
+    plan: GrowingPlan,
     atoms: Bools,
     spare: Ints,
     col: int,
@@ -90,7 +84,7 @@ def fetch(
     distance: Ints,
     chosen: Bools,
     farthest: int,
-) -> Growing:
+) -> GrowingPlan:
     """Move the atoms of the chosen rows into a column by one horizontal scan.
 
     Updates ``atoms``, ``spare`` and ``distance``, which is 0 afterwards where an atom was moved.
@@ -107,22 +101,24 @@ def fetch(
     """
     for steps in range(farthest, 0, -1):
         source = col + side * steps
-        n_before = plan[1]
+        n_before = count_moves(plan)
         for row in range(len(distance)):
             if chosen[row] and distance[row] == steps:
                 plan = add_move(plan, row, source, row, col)
                 atoms[row, source] = False
                 atoms[row, col] = True
                 distance[row] = 0
-        n_taken = plan[1] - n_before
+        n_taken = count_moves(plan) - n_before
         spare[source] -= n_taken
         spare[col] += n_taken
-        plan = end_batch(plan)
+        plan = end_batch(plan, False)
     return plan
 
 
-@helper_kernel(f"Tuple(({GROWING}, {SCANS}))({GROWING}, {SCANS}, bool_[:, ::1], int64[::1], int64)")
-def presort(plan: Growing, scans: Scans, atoms: Bools, spare: Ints, limit: int) -> tuple[Growing, Scans]:
+@helper_kernel()
+def presort(
+    plan: GrowingPlan, scans: Scans, atoms: Bools, spare: Ints, limit: int
+) -> tuple[GrowingPlan, Scans]:
     """Supply the columns that lack atoms, in turns, until none does or nothing helps.
 
     The side with more atoms to spare in all gives its nearest atoms in the rows
@@ -133,7 +129,7 @@ def presort(plan: Growing, scans: Scans, atoms: Bools, spare: Ints, limit: int) 
     distance = np.empty(n_rows, np.int64)
     chosen = np.empty(n_rows, np.bool_)
     for _ in range(n_cols):
-        n_before = plan[1]
+        n_before = count_moves(plan)
         for col in range(n_cols):
             if spare[col] >= 0:
                 continue
@@ -146,16 +142,16 @@ def presort(plan: Growing, scans: Scans, atoms: Bools, spare: Ints, limit: int) 
                 farthest = choose_nearest(distance, chosen, min(n_wanted, limit))
                 if farthest == 0:
                     break
-                n_start = plan[1]
+                n_start = count_moves(plan)
                 plan = fetch(plan, atoms, spare, col, side, distance, chosen, farthest)
                 scans = add_scan(scans, farthest + 1)
-                n_wanted -= plan[1] - n_start
-        if plan[1] == n_before:
+                n_wanted -= count_moves(plan) - n_start
+        if count_moves(plan) == n_before:
             break
     return plan, scans
 
 
-@helper_kernel("int64(int64[:, ::1], int64[:, ::1], int64[::1], int64, int64, int64, int64)")
+@helper_kernel()
 def end_of_move(place: Ints, goal: Ints, n_atoms: Ints, n_rows: int, col: int, i: int, sense: int) -> int:
     """Row where a scan drops atom ``i`` of a column: its goal or before the next atom; its own if it stays.
 
@@ -172,8 +168,8 @@ def end_of_move(place: Ints, goal: Ints, n_atoms: Ints, n_rows: int, col: int, i
     return max(end, place[col, i] * sense) * sense
 
 
-@helper_kernel(f"{GROWING}({GROWING}, int64[:, ::1], int64[:, ::1], int64[::1], int64, int64)")
-def scan(plan: Growing, place: Ints, goal: Ints, n_atoms: Ints, sense: int, limit: int) -> Growing:
+@helper_kernel()
+def scan(plan: GrowingPlan, place: Ints, goal: Ints, n_atoms: Ints, sense: int, limit: int) -> GrowingPlan:
     """Move a row of tweezers over all rows once; each carries one atom of its column at a time.
 
     Atoms that are picked up on the same row and dropped on the same row make a batch. ``sense``
@@ -207,19 +203,19 @@ def scan(plan: Growing, place: Ints, goal: Ints, n_atoms: Ints, sense: int, limi
         end = row
         while n_picked > 0:
             end += sense
-            n_before = plan[1]
+            n_before = count_moves(plan)
             for col in range(n_cols):
                 if picked[col] == end:
                     plan = add_move(plan, row, col, end, col)
-            n_picked -= plan[1] - n_before
-            plan = end_batch(plan)
+            n_picked -= count_moves(plan) - n_before
+            plan = end_batch(plan, False)
     return plan
 
 
-@helper_kernel(f"Tuple(({GROWING}, {SCANS}))({GROWING}, {SCANS}, {GRID}, {GRID}, {GRID}, int64, boolean)")
+@helper_kernel()
 def sort_columns(
-    plan: Growing, scans: Scans, atoms: Bools, fill: Bools, clear: Bools, limit: int, may_eject: bool
-) -> tuple[Growing, Scans]:
+    plan: GrowingPlan, scans: Scans, atoms: Bools, fill: Bools, clear: Bools, limit: int, may_eject: bool
+) -> tuple[GrowingPlan, Scans]:
     """Scan downwards and upwards in turns until every atom is where it goes.
 
     No column may hold fewer atoms than it has fill sites. Atoms are ejected below the last row only.
@@ -236,9 +232,9 @@ def sort_columns(
     n_idle = 0
     sense = 1
     while n_idle < 2:
-        n_held, n_before = np.sum(n_atoms), plan[1]
+        n_held, n_before = np.sum(n_atoms), count_moves(plan)
         plan = scan(plan, place, goal, n_atoms, sense, limit)
-        n_idle = 0 if plan[1] > n_before else n_idle + 1
+        n_idle = 0 if count_moves(plan) > n_before else n_idle + 1
         if n_idle == 0:
             ejects = np.sum(n_atoms) < n_held
             scans = add_scan(scans, n_rows + 1 if ejects else n_rows)
@@ -246,25 +242,24 @@ def sort_columns(
     return plan, scans
 
 
-@helper_kernel(f"{SCANS}({SCANS}, {GROWING}, int64, int64)")
-def scans_of_exchanges(scans: Scans, plan: Growing, first_move: int, n_lines: int) -> Scans:
-    """Add a scan for each batch from a move on: over the lines between its outermost sites."""
-    log, n_moves, _ = plan
-    low, high = n_lines, 0
-    for n in range(first_move, n_moves):
-        along = 2 if log[n, 1] == log[n, 3] else 1
-        for at in (along, along + 2):
-            low, high = min(low, log[n, at]), max(high, log[n, at])
-        if n + 1 == n_moves or log[n + 1, 0] != log[n, 0]:
-            scans = add_scan(scans, high - low + 1)
-            low, high = n_lines, 0
+@helper_kernel()
+def scans_of_exchanges(scans: Scans, plan: GrowingPlan, first_batch: int) -> Scans:
+    """Add a scan for each batch from one on: over the lines between its outermost sites."""
+    moves, offsets, _, n_batches = plan
+    for batch in range(first_batch, n_batches):
+        low, high = len(moves), 0
+        axis = 1 if moves[offsets[batch], 0] == moves[offsets[batch], 2] else 0
+        for n in range(offsets[batch], offsets[batch + 1]):
+            start, end = int(moves[n, axis]), int(moves[n, axis + 2])
+            low, high = min(low, start, end), max(high, start, end)
+        scans = add_scan(scans, high - low + 1)
     return scans
 
 
-@kernel(f"Tuple(({GROWING}, {SCANS}))({GRID}, {GRID}, {GRID}, int64, int64, int64)")
+@kernel(f"Tuple(({FINISHED_PLAN}, int64[::1]))({GRID}, {GRID}, {GRID}, int64, int64, int64)")
 def plan_mta1(
     occupied: Bools, fill: Bools, clear: Bools, row_tones: int, column_tones: int, slots: int
-) -> tuple[Growing, Scans]:
+) -> tuple[FinishedPlan, Ints]:
     """Plan MTA1.
 
     Args:
@@ -274,12 +269,16 @@ def plan_mta1(
         row_tones: Maximum number of tweezers in a column.
         column_tones: Maximum number of tweezers in a row.
         slots: Ejection slots on each side.
+
+    Returns:
+        The plan, and how many lines each scan passes, int64 (n_scans,).
     """
     atoms = occupied.copy()
     spare = column_sums(atoms) - column_sums(fill)
-    plan, scans = empty_plan(atoms.size), (np.empty(4 * len(atoms), np.int64), 0)
+    plan, scans = empty_plan(2 * atoms.size), (np.empty(4 * len(atoms), np.int64), 0)
     plan, scans = presort(plan, scans, atoms, spare, row_tones)
-    n_presorted = plan[1]
+    n_presorted = plan[3]
     plan = supply_columns(plan, atoms, spare, column_tones)
-    scans = scans_of_exchanges(scans, plan, n_presorted, max(occupied.shape))
-    return sort_columns(plan, scans, atoms, fill, clear, column_tones, slots > 0)
+    scans = scans_of_exchanges(scans, plan, n_presorted)
+    plan, scans = sort_columns(plan, scans, atoms, fill, clear, column_tones, slots > 0)
+    return finished(plan), scans[0][: scans[1]].copy()

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
-from labseq_scans import kernels_lines as kernels
-from labseq_scans.planners import as_plan
+from labseq_rivals import kernels_lines as kernels, kernels_tetris
 from numpy.typing import NDArray
 
 from labseq import MotionSpec, TargetPattern, check_plan
+from labseq.plugin.plan_kernels import add_turns, as_plan, empty_plan, finished
 from labseq.testing.strategies import occupancies
 
 Line = list[bool]
@@ -78,7 +78,7 @@ class TestSettle:
         assert settled(full, [False] * 4, full, low=False, high=False)[1] == [0, 1, 2, 3]
 
 
-class TestAddLine:
+class TestTakeTurnsOutwards:
     """The batches of a line, as the check sees them."""
 
     @given(lines(), st.integers(1, 4), st.integers(1, 2), st.booleans())
@@ -90,7 +90,8 @@ class TestAddLine:
         n = len(atoms)
         source, goal = settled(atoms, fill, clear, low=True, high=True)
         lists = np.array(source, np.int64), np.array(goal, np.int64)
-        plan = as_plan(kernels.add_line(kernels.empty_plan(0), *lists, n, 0, is_row, limit, slots))
+        turns = kernels_tetris.take_turns_outwards(*lists, n, limit, slots)
+        plan = as_plan(finished(add_turns(empty_plan(0), (is_row, 0, n), *lists, turns)))
         shape = (1, n) if is_row else (n, 1)
         target = TargetPattern(bools(fill).reshape(shape), bools(clear).reshape(shape))
         before = bools(atoms).reshape(shape)
@@ -113,7 +114,7 @@ class TestSupplyColumns:
         assume(need.sum() <= np.count_nonzero(atoms))
         limit = data.draw(st.integers(1, 4), "limit")
         after, spare = atoms.copy(), atoms.sum(axis=0).astype(np.int64) - need
-        made = kernels.supply_columns(kernels.empty_plan(0), after, spare, limit)
+        made = finished(kernels.supply_columns(empty_plan(0), after, spare, limit))
         nothing = np.zeros(atoms.shape, np.bool_)
         report = check_plan(as_plan(made), atoms, TargetPattern(nothing, nothing), limit)
         assert np.array_equal(report.predicted, after)
@@ -123,9 +124,9 @@ class TestSupplyColumns:
     def test_all_exchanges_of_a_row_are_made_at_once(self) -> None:
         atoms = bools([[1, 1, 1, 1, 0, 0], [0, 0, 0, 0, 1, 1]])
         spare = np.array([1, 1, 0, 0, -1, -1], np.int64)
-        log, n_moves, n_batches = kernels.supply_columns(kernels.empty_plan(1), atoms, spare, 4)
-        assert n_batches == 1
-        assert log[:n_moves, [2, 4]].tolist() == [[0, 2], [1, 3], [2, 4], [3, 5]]
+        moves, offsets, _ = finished(kernels.supply_columns(empty_plan(1), atoms, spare, 4))
+        assert offsets.tolist() == [0, 4]
+        assert moves[:, [1, 3]].tolist() == [[0, 2], [1, 3], [2, 4], [3, 5]]
         assert spare.tolist() == [0] * 6
 
     @pytest.mark.parametrize("upwards", [False, True])
@@ -134,6 +135,6 @@ class TestSupplyColumns:
         if upwards:
             atoms = atoms[::-1].copy()
         spare = np.array([1, -1], np.int64)
-        log, n_moves, _ = kernels.supply_columns(kernels.empty_plan(1), atoms, spare, 1)
+        moves, _, _ = finished(kernels.supply_columns(empty_plan(1), atoms, spare, 1))
         start, end = (1, 0) if upwards else (0, 1)
-        assert log[:n_moves, 1:].tolist() == [[start, 0, end, 0], [end, 0, end, 1]]
+        assert moves.tolist() == [[start, 0, end, 0], [end, 0, end, 1]]

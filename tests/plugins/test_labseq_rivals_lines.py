@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_scans.pattern import InterleavedSettings, interleaved
-from labseq_scans.planners import ScannedPlan
+from labseq_rivals.interleaved import InterleavedSettings, interleaved
+from labseq_rivals.planners import ScannedPlan
 from pydantic import ValidationError
 
 from labseq.plugin import Context, LimitError, MotionSpec, Plan, SiteGrid, TargetPattern

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 from hypothesis import given, settings, strategies as st
-from labseq_single import kernels
-from labseq_single.kernels import CROSSED, NO_END, STEP, TURN, UNWANTED
+from labseq_rivals.kernels_board import CROSSED, NO_END, STEP, TURN, UNWANTED, cheapest_path
+from labseq_rivals.kernels_hca import distance_in_the_open
+from labseq_rivals.kernels_lsap import plan_assignment
 from numpy.typing import NDArray
 
 from labseq.testing.strategies import masks, shapes
@@ -56,7 +57,7 @@ def test_the_cheapest_path_is_found(data: st.DataObject) -> None:
     if data.draw(st.booleans(), "ends outside"):
         end_cost[~inside] = UNWANTED
     paths = [p for start in np.flatnonzero(starts) for p in all_paths(int(start), inside, width, end_cost)]
-    path = kernels.cheapest_path((atoms, inside, width), starts, end_cost).tolist()
+    path = cheapest_path((atoms, inside, width), starts, end_cost).tolist()
     if not paths:
         assert path == []
         return
@@ -76,7 +77,7 @@ def test_distances_in_the_open_are_those_of_paths_over_free_sites(data: st.DataO
         for site in np.flatnonzero(inside & ~atoms & (expected < 0)):
             if any(expected[site + step] == length - 1 for step in (-width, -1, 1, width)):
                 expected[site] = length
-    distance = kernels.distance_in_the_open((atoms, inside, width), starts)
+    distance = distance_in_the_open((atoms, inside, width), starts)
     assert distance.tolist() == expected.tolist()
 
 
@@ -91,9 +92,9 @@ def test_any_assignment_can_be_carried_out(data: st.DataObject) -> None:
     chosen = np.array(data.draw(st.permutations(sources.tolist()), "sources")[:n], np.int64)
     wanted = np.zeros(shape, np.bool_)
     wanted.ravel()[goals[:n]] = True
-    moves, _, n_moves = kernels.plan_assignment(atoms, wanted, np.zeros_like(wanted), chosen, goals[:n], True)
+    moves, _, _ = plan_assignment(atoms, wanted, np.zeros_like(wanted), chosen, goals[:n], True)
     now = atoms.copy()
-    for row, col, to_row, to_col in moves[:n_moves].tolist():
+    for row, col, to_row, to_col in moves.tolist():
         assert now[row, col]
         down, right = np.sign(to_row - row), np.sign(to_col - col)
         for i in range(1, abs(to_row - row) + abs(to_col - col) + 1):

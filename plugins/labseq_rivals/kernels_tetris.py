@@ -5,21 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from labseq.plugin import helper_kernel, kernel
-from labseq_scans.kernels_lines import (
-    GRID,
-    GROWING,
-    Bools,
-    Growing,
-    Ints,
+from labseq.plugin.plan_kernels import (
+    FINISHED_PLAN,
+    FinishedPlan,
+    GrowingPlan,
     add_line,
+    add_turns,
     column_sums,
     empty_plan,
-    settle,
-    supply_columns,
+    finished,
 )
+from labseq_rivals.kernels_lines import GRID, Bools, Ints, settle, supply_columns
 
 
-@helper_kernel(f"int64[:, ::1]({GRID})")
+@helper_kernel()
 def fill_rows(fill: Bools) -> Ints:
     """List the rows of each column's fill sites, int64 (n_cols, n_rows + 1); ``n_rows`` after the last."""
     n_rows, n_cols = fill.shape
@@ -33,7 +32,7 @@ def fill_rows(fill: Bools) -> Ints:
     return rows
 
 
-@helper_kernel("void(bool_[::1], int64[:, ::1], int64[::1], bool_[::1])")
+@helper_kernel()
 def choose_columns(atoms: Bools, rows: Ints, piled: Ints, chosen: Bools) -> None:
     """Choose the columns that the atoms of a row go to: those whose next open target row is the uppermost.
 
@@ -61,8 +60,8 @@ def choose_columns(atoms: Bools, rows: Ints, piled: Ints, chosen: Bools) -> None
         piled[col] += chosen[col]
 
 
-@helper_kernel(f"{GROWING}({GROWING}, bool_[:, ::1], {GRID}, int64)")
-def pile_up(plan: Growing, atoms: Bools, fill: Bools, limit: int) -> Growing:
+@helper_kernel()
+def pile_up(plan: GrowingPlan, atoms: Bools, fill: Bools, limit: int) -> GrowingPlan:
     """Arrange row after row, from the top, until each target site has its atom in its column."""
     n_rows, n_cols = atoms.shape
     rows = fill_rows(fill)
@@ -76,14 +75,44 @@ def pile_up(plan: Growing, atoms: Bools, fill: Bools, limit: int) -> Growing:
             atoms[row, site] = False
         for site in goal:
             atoms[row, site] = True
-        plan = add_line(plan, source, goal, n_cols, row, True, limit, 0)
+        plan = add_line(plan, (True, row, n_cols), source, goal, limit, 0)
     return plan
 
 
-@kernel(f"{GROWING}({GRID}, {GRID}, {GRID}, int64, int64, int64)")
+@helper_kernel()
+def take_turns_outwards(source: Ints, goal: Ints, n_sites: int, limit: int, slots: int) -> Ints:
+    """Distribute the atoms that move in a line over batches; arguments and result as of ``take_turns``.
+
+    Those that move up, to higher sites, go one after the other from the upper end, then those that move down
+    from the lower end: each finds its way free, at the latest in the same batch. An ejection waits for a free
+    slot, and whatever is behind it waits as well.
+    """
+    n_atoms = len(source)
+    turns = np.zeros(n_atoms, np.int64)
+    up, down, turn = n_atoms - 1, 0, 0
+    while up >= 0 or down < n_atoms:
+        turn += 1
+        n = n_ejected = 0
+        while up >= 0 and n < limit and not (goal[up] >= n_sites and n_ejected == slots):
+            n_ejected += goal[up] >= n_sites
+            if goal[up] > source[up]:
+                turns[up] = turn
+                n += 1
+            up -= 1
+        n_ejected = 0
+        while down < n_atoms and n < limit and not (goal[down] < 0 and n_ejected == slots):
+            n_ejected += goal[down] < 0
+            if goal[down] < source[down]:
+                turns[down] = turn
+                n += 1
+            down += 1
+    return turns
+
+
+@kernel(f"{FINISHED_PLAN}({GRID}, {GRID}, {GRID}, int64, int64, int64)")
 def plan_tetris(
     occupied: Bools, fill: Bools, clear: Bools, row_limit: int, column_limit: int, slots: int
-) -> Growing:
+) -> FinishedPlan:
     """Plan the Tetris algorithm.
 
     Args:
@@ -96,10 +125,11 @@ def plan_tetris(
     """
     n_rows, n_cols = occupied.shape
     atoms = occupied.copy()
-    plan = pile_up(empty_plan(atoms.size), atoms, fill, row_limit)
+    plan = pile_up(empty_plan(2 * atoms.size), atoms, fill, row_limit)
     plan = supply_columns(plan, atoms, column_sums(atoms) - column_sums(fill), row_limit)
     for col in range(n_cols):
         line = atoms[:, col].copy(), fill[:, col].copy(), clear[:, col].copy()
         source, goal = settle(line[0], line[1], line[2], slots > 0, slots > 0)
-        plan = add_line(plan, source, goal, n_rows, col, False, column_limit, slots)
-    return plan
+        turns = take_turns_outwards(source, goal, n_rows, column_limit, slots)
+        plan = add_turns(plan, (False, col, n_rows), source, goal, turns)
+    return finished(plan)
