@@ -1,8 +1,29 @@
-"""Kernels that turn rows and columns of a batch into paths of tones.
+r"""Kernels that turn rows and columns of a batch into paths of tones.
 
 The tweezers leave their sites for the *lanes* half-way between rows and half-way between columns, go along
-these, and reach their goals from there: in a lane they keep half a line's distance from every site.
-Everything is written for tones of the rows first; with rows and columns swapped it is the same.
+these, and reach their goals from there: in a lane they keep half a line's distance from every site. The way
+of one tweezer from row 0, column 0 to row 2, column 3::
+
+    row 0   o       o       o       o      o  a site
+              1                            1  off the site, to where two lanes cross
+    lane    . + - - - 2 - - - - + . .      2  columns move along the lanes of the rows
+                                |
+    row 1   o       o       o   3   o      3  rows move along the lanes of the columns
+                                |
+    lane    . . . . . . . . . . + 4 .      4  columns go to their lines,
+                                    5      5  then rows, and the tweezers are dropped off
+    row 2   o       o       o       o
+
+A lane of a triangular lattice may weave, see :func:`add_travel`::
+
+    o       o       o       o
+       ,-.     ,-.     ,-.
+      /   \   /   \   /   \
+     '     `-'     `-'     `
+        o       o       o
+
+Positions are in lines: 2.0 is the third row or column, 2.5 the lane behind it. Everything is written for
+tones of the rows first; with rows and columns swapped it is the same.
 """
 
 from __future__ import annotations
