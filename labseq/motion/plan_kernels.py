@@ -45,7 +45,7 @@ SITES: Final = const("int64", 1)
 def empty_plan(n_moves: int) -> GrowingPlan:
     """Make a plan without moves; it becomes longer than ``n_moves`` if need be."""
     offsets = np.empty(n_moves + 2, np.int32)
-    offsets[:2] = 0
+    offsets[0] = offsets[1] = 0
     return np.empty((n_moves, 4), np.int16), offsets, np.empty(n_moves, np.bool_), 0
 
 
@@ -63,9 +63,14 @@ def with_room(plan: GrowingPlan, n_more: int) -> GrowingPlan:
     if n_moves + n_more <= len(moves):
         return plan
     longer = empty_plan(2 * len(moves) + n_more)
-    longer[0][:n_moves] = moves[:n_moves]
-    longer[1][: n_batches + 2] = offsets[: n_batches + 2]
-    longer[2][:n_batches] = linked[:n_batches]
+    # element by element: numba takes seconds to compile the assignment of slices
+    for n in range(n_moves):
+        for k in range(4):
+            longer[0][n, k] = moves[n, k]
+    for n in range(n_batches + 2):
+        longer[1][n] = offsets[n]
+    for n in range(n_batches):
+        longer[2][n] = linked[n]
     return longer[0], longer[1], longer[2], n_batches
 
 

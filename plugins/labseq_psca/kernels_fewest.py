@@ -2,7 +2,8 @@
 
 Everything is written for row sorting and then column compression; the other
 orientation is the same on the transposed grid. The vocabulary is that of
-:mod:`labseq_psca.kernels_columns` and :mod:`labseq_psca.kernels_rows`.
+:mod:`labseq_psca.kernels_lines`. ``need``, ``room`` and ``count``, int64 (n_cols,), are
+the fill sites of each column, its sites that may hold an atom, and its atoms now.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from labseq.plugin import helper_kernel, kernel
 from labseq.plugin.plan_kernels import (
     FINISHED_PLAN,
+    GROWING_PLAN,
     FinishedPlan,
     GrowingPlan,
     column_sums,
@@ -23,10 +25,20 @@ from labseq.plugin.plan_kernels import (
     finished,
     unlock_row,
 )
-from labseq_psca.kernels_columns import GRID, IMPOSSIBLE, Bools, Ints, compress_columns
-from labseq_psca.kernels_rows import place_in_order, sort_row, weigh_columns
+from labseq_psca.kernels_lines import (
+    GRID,
+    IMPOSSIBLE,
+    Bools,
+    Ints,
+    compress_columns,
+    place_in_order,
+    sort_row,
+)
 
-# What changes are worth, in units of one atom moved, beside those of kernels_rows: README, "Choices".
+# What changes are worth, in units of one atom moved: docs/explanation/psca.md, "Choices".
+NEED: Final = 80  # for an atom in a column that lacks one: this plus the number of columns, times its lack,
+LACK_COUNTS: Final = 8  # which counts up to here
+TARGET_COLUMN: Final = 20  # less for an atom that leaves a column with fill sites
 ON_TARGET: Final = 10  # more for an atom that lands on a fill site, less for one that leaves it
 EFFORT: Final = 240  # columns looked at closely for each choice, but no fewer than
 ROWS_TRIED: Final = 3  # so many rows; more hardly helps
@@ -35,6 +47,33 @@ PER_BATCH: Final = 1000  # worth per batch is compared in integers, in thousandt
 
 Work = tuple[Ints, NDArray[np.int8], Ints, Ints]
 """int64 (> n_cols,) and int8 (n_cols, > n_cols) for an exchange; int64 (3, n_cols) and (n_rows,)."""
+
+
+@helper_kernel()
+def weigh_columns(need: Ints, room: Ints, count: Ints, weight: Ints, leave: Ints) -> int:
+    """Work out what one atom more or less is worth to each column.
+
+    Args:
+        need: See the module, as for ``room`` and ``count``.
+        room: See there.
+        count: See there.
+        weight: Result, int64 (n_cols,): worth of one more; 0 if it lacks none.
+        leave: Result, int64 (n_cols,): cost of one less; -1 if it can spare none.
+
+    Returns:
+        How many atoms the columns lack in all.
+    """
+    n_lacking = 0
+    for col in range(len(need)):
+        lack = need[col] - count[col]
+        weight[col] = 0
+        leave[col] = -1
+        if lack > 0:
+            n_lacking += lack
+            weight[col] = (NEED + len(need)) * min(lack, LACK_COUNTS)
+        elif lack < 0:
+            leave[col] = TARGET_COLUMN if need[col] > 0 and count[col] <= room[col] else 0
+    return n_lacking
 
 
 @helper_kernel()
@@ -179,7 +218,7 @@ def choose_row(
     return best_row
 
 
-@helper_kernel()
+@helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, bool_[:, ::1], {GRID}, {GRID}, int64, int64)")
 def sort_rows(
     plan: GrowingPlan, atoms: Bools, fill: Bools, clear: Bools, limit: int, order: int
 ) -> GrowingPlan:
@@ -207,7 +246,7 @@ def sort_rows(
     return plan
 
 
-@helper_kernel()
+@helper_kernel(f"int64({GRID}, {GRID}, {GRID}, int64)")
 def least_batches(atoms: Bools, fill: Bools, clear: Bools, limit: int) -> int:
     """Count the batches that the compression of all columns takes at least, after row sorting."""
     n_rows, n_cols = atoms.shape
@@ -248,7 +287,9 @@ def costs(plan: GrowingPlan) -> tuple[int, int, int]:
 def finished_swapped(plan: GrowingPlan) -> FinishedPlan:
     """Cut a plan of the transposed grid to its batches, and swap its rows and columns back."""
     moves, offsets, linked = finished(plan)
-    return moves[:, np.array([1, 0, 3, 2])].copy(), offsets, linked
+    for move in moves:
+        move[0], move[1], move[2], move[3] = move[1], move[0], move[3], move[2]
+    return moves, offsets, linked
 
 
 @kernel(f"{FINISHED_PLAN}({GRID}, {GRID}, {GRID}, int64, int64, int64, int64)")
@@ -269,8 +310,7 @@ def plan_fewest(
         slots: Ejection slots on each side.
         order: Which of equal rows goes first: HALF_FILLED, FULLEST or EMPTIEST.
     """
-    # copies of what is only read, for both orientations to be compiled as one
-    atoms, fill, clear = occupied.copy(), fill.copy(), clear.copy()
+    atoms = occupied.copy()
     other_atoms, other_fill, other_clear = transposed(occupied), transposed(fill), transposed(clear)
     plan = sort_rows(empty_plan(2 * atoms.size), atoms, fill, clear, row_limit, order)
     other = sort_rows(empty_plan(2 * atoms.size), other_atoms, other_fill, other_clear, column_limit, order)

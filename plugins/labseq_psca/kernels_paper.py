@@ -1,6 +1,6 @@
 """Kernels of the variant as in the paper's text: each row is sorted once, for the columns most in need.
 
-The vocabulary is that of :mod:`labseq_psca.kernels_columns` and :mod:`labseq_psca.kernels_rows`.
+The vocabulary is that of :mod:`labseq_psca.kernels_lines`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from labseq.plugin.plan_kernels import (
     finished,
     unlock_row,
 )
-from labseq_psca.kernels_columns import GRID, Bools, Ints, compress_columns
-from labseq_psca.kernels_rows import place_in_order, sort_row
+from labseq_psca.kernels_lines import GRID, Bools, Ints, compress_columns, place_in_order, sort_row
 
 
 @helper_kernel()

@@ -88,6 +88,25 @@ def cheapest_shift(atoms: Bools, fill: Bools, row: int, col: int, costs: Costs) 
 
 
 @helper_kernel()
+def dearest_defect(atoms: Bools, fill: Bools, left: Bools, costs: Costs) -> tuple[int, int]:
+    """Find the defect of those ``left`` whose shift costs most, or that has none: row and column, or -1.
+
+    Sites that hold an atom are removed from ``left``.
+    """
+    row = col = -1
+    highest = -1.0
+    for r in range(atoms.shape[0]):
+        for c in range(atoms.shape[1]):
+            left[r, c] &= not atoms[r, c]
+            if left[r, c]:
+                cost, n_defects, _ = cheapest_shift(atoms, fill, r, c, costs)
+                cost = np.inf if n_defects == 0 else cost
+                if cost > highest:
+                    row, col, highest = r, c, cost
+    return row, col
+
+
+@helper_kernel()
 def cheapest_chain(
     atoms: Bools, fill: Bools, clear: Bools, row: int, col: int, costs: Costs
 ) -> tuple[float, Ints]:
@@ -247,10 +266,12 @@ def add_chain(plan: GrowingPlan, atoms: Bools, sites: Ints, row_limit: int, colu
         n = last - first - 1
         source, goal = np.empty(n, np.int64), np.empty(n, np.int64)
         axis = 1 if is_row else 0
-        for i in range(n):
-            source[i], goal[i] = sites[at[first + 1 + i], axis], sites[at[first + i], axis]
+        ascends = sites[at[last - 1], axis] > sites[at[first], axis]
+        for k in range(n):
+            i = first + k if ascends else last - 2 - k
+            source[k], goal[k] = sites[at[i + 1], axis], sites[at[i], axis]
         limit = row_limit if is_row else column_limit
-        plan = add_run(plan, atoms, np.sort(source), np.sort(goal), row, col, is_row, limit)
+        plan = add_run(plan, atoms, source, goal, row, col, is_row, limit)
         first = last - 1
     return plan
 
@@ -279,18 +300,9 @@ def plan_repair(
     """
     atoms = occupied.copy()
     plan = empty_plan(atoms.size)
-    n_rows, n_cols = atoms.shape
-    left = fill & ~atoms
+    left = fill.copy()
     while plan[3] <= 3 * atoms.size:
-        row = col = -1
-        highest = -1.0
-        for r in range(n_rows):
-            for c in range(n_cols):
-                if left[r, c]:
-                    cost, n_defects, _ = cheapest_shift(atoms, fill, r, c, costs)
-                    cost = np.inf if n_defects == 0 else cost
-                    if cost > highest:
-                        row, col, highest = r, c, cost
+        row, col = dearest_defect(atoms, fill, left, costs)
         if row < 0:
             break
         cost, n_defects, shift = cheapest_shift(atoms, fill, row, col, costs)
@@ -300,5 +312,4 @@ def plan_repair(
         elif len(sites) > 0:
             plan = add_chain(plan, atoms, sites, row_limit, column_limit)
         left[row, col] = False
-        left &= ~atoms
     return finished(plan), atoms

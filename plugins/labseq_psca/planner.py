@@ -88,7 +88,7 @@ class PscaPlanner:
         )
         self._settings = settings
         self._eject_slots = motion.eject_slots
-        # as in kernels_rows, which is not imported here: it takes numba
+        # as in kernels_lines, which is not imported here: it takes numba
         self._order = {"half_filled": 0, "fullest": -1, "emptiest": 1}[settings.row_order]
         self._grid = context.grid
         self._repair: Repair | None = None

@@ -37,7 +37,7 @@ NO_END: Final = -1
 N_DIRECTIONS: Final = 4
 
 
-@helper_kernel()
+@helper_kernel(f"bool_[::1]({GRID})")
 def with_margin(sites: Bools) -> Bools:
     """Flatten a mask, with a margin of one site, False there."""
     n_rows, n_cols = sites.shape
@@ -140,7 +140,7 @@ def add_segment(plan: GrowingPlan, source: int, goal: int, width: int, goes_on: 
     return end_batch(add_move(plan, row, col, to_row, to_col), goes_on)
 
 
-@helper_kernel()
+@helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, {BOARD}, int64[::1], int64, int64)")
 def carry(plan: GrowingPlan, board: Board, path: Ints, start: int, stop: int) -> GrowingPlan:
     """Carry the atom at ``path[start]`` to ``path[stop]``, by a batch for each straight piece.
 

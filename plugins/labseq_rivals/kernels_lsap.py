@@ -25,7 +25,7 @@ from labseq_rivals.kernels_board import (
 )
 
 
-@helper_kernel()
+@helper_kernel("int64[::1](int64, int64, int64, boolean)")
 def l_shaped(source: int, goal: int, width: int, row_first: bool) -> Ints:
     """List the sites of the L from a source to a goal, along the source's row first or last."""
     down = goal // width - source // width

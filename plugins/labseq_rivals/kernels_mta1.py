@@ -11,6 +11,7 @@ import numpy as np
 from labseq.plugin import helper_kernel, kernel
 from labseq.plugin.plan_kernels import (
     FINISHED_PLAN,
+    GROWING_PLAN,
     FinishedPlan,
     GrowingPlan,
     add_move,
@@ -168,7 +169,7 @@ def end_of_move(place: Ints, goal: Ints, n_atoms: Ints, n_rows: int, col: int, i
     return max(end, place[col, i] * sense) * sense
 
 
-@helper_kernel()
+@helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, int64[:, ::1], int64[:, ::1], int64[::1], int64, int64)")
 def scan(plan: GrowingPlan, place: Ints, goal: Ints, n_atoms: Ints, sense: int, limit: int) -> GrowingPlan:
     """Move a row of tweezers over all rows once; each carries one atom of its column at a time.
 

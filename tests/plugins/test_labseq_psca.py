@@ -12,7 +12,7 @@ import labseq_psca
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
-from labseq_psca import kernels_columns, kernels_fewest, kernels_repair
+from labseq_psca import kernels_fewest, kernels_lines, kernels_repair
 from labseq_psca.planner import PscaPlanner, PscaSettings, ToneLimits
 from labseq_psca.repair import RepairPlanner, RepairSettings
 from numpy.typing import NDArray
@@ -239,7 +239,7 @@ def plans_of_both_ways(
         after, fill, clear = (np.array(grid, order="C") for grid in grids)
         plan = kernels_fewest.sort_rows(empty_plan(after.size), after, fill, clear, along, 0)
         bound = plan[3] + kernels_fewest.least_batches(after, fill, clear, across)
-        plan = kernels_columns.compress_columns(plan, after, fill, clear, across, planner._eject_slots)
+        plan = kernels_lines.compress_columns(plan, after, fill, clear, across, planner._eject_slots)
         found.append((kernels_fewest.costs(plan), bound))
         along, across = across, along
     return found

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from hypothesis import assume, given, settings, strategies as st
-from labseq_psca import kernels_columns, kernels_fewest, kernels_rows
+from labseq_psca import kernels_fewest, kernels_lines
 from numpy.typing import NDArray
 
 from labseq.plugin.plan_kernels import empty_plan, finished
@@ -42,9 +42,7 @@ class TestCompress:
         goal = np.zeros(n, np.int64)
         cost, step = np.zeros((n, 2 * n + 1), np.int64), np.zeros((n, 2 * n + 1), np.int16)
         goal = goal[: len(source)]
-        assert kernels_columns.compress(
-            ints(source), bools(fill), bools(clear), limit, slots, cost, step, goal
-        )
+        assert kernels_lines.compress(ints(source), bools(fill), bools(clear), limit, slots, cost, step, goal)
         return goal.tolist()
 
     @staticmethod
@@ -86,7 +84,7 @@ class TestCompress:
     def test_too_few_atoms_for_the_fill_sites(self) -> None:
         cost, step = np.zeros((2, 5), np.int64), np.zeros((2, 5), np.int16)
         fill, clear = bools([True, True]), bools([False, False])
-        assert not kernels_columns.compress(ints([0]), fill, clear, 1, 1, cost, step, ints([0]))
+        assert not kernels_lines.compress(ints([0]), fill, clear, 1, 1, cost, step, ints([0]))
 
 
 class TestBestExchange:
@@ -124,7 +122,7 @@ class TestBestExchange:
         row, count = bools([atoms]), np.zeros(n, np.int64)
         before = np.flatnonzero(row)
         n_moved = kernels_fewest.n_moved(row[0], change)
-        plan = finished(kernels_rows.sort_row(empty_plan(n), row, 0, change, count, n))
+        plan = finished(kernels_lines.sort_row(empty_plan(n), row, 0, change, count, n))
         moves = [[0, a, 0, b] for a, b in zip(before, np.flatnonzero(row), strict=True) if a != b]
         assert sorted(plan[0].tolist()) == moves
         assert n_moved == len(moves)

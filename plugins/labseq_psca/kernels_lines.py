@@ -1,10 +1,12 @@
-"""Kernels of column compression, the second step of all variants of PSCA.
+"""Kernels of the two steps that both variants of PSCA share: a row is sorted, columns are compressed.
 
 In all kernels ``atoms`` marks the sites that hold an atom, ``fill`` those that must
 hold one and ``clear`` those that must be empty: bool (n_rows, n_cols), or (n_sites,)
 for a line. ``limit`` is the maximum number of atoms in a batch, and ``slots`` the
 number of ejection slots on each side. ``source`` and ``goal`` are those of
-:mod:`labseq.plugin.plan_kernels`.
+:mod:`labseq.plugin.plan_kernels`. ``change``, int64 (n_cols,), is an exchange of a row's atoms:
+-1 where an atom leaves its column, 1 where a vacancy is filled, otherwise 0; the atoms of the row
+keep their order.
 """
 
 from __future__ import annotations
@@ -15,13 +17,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import const, helper_kernel
-from labseq.plugin.plan_kernels import GrowingPlan, add_line
+from labseq.plugin.plan_kernels import GROWING_PLAN, GrowingPlan, add_line, sites_of
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 GRID: Final = const("bool_", 2)
 IMPOSSIBLE: Final = 1 << 60
+
+# Which of equal rows goes first: closest to half filled, or by a factor of its number of atoms.
+HALF_FILLED: Final = 0
+FULLEST: Final = -1
+EMPTIEST: Final = 1
+
+
+@helper_kernel()
+def place_in_order(n_atoms: int, n_sites: int, order: int) -> int:
+    """Place of a row in an order (HALF_FILLED, FULLEST or EMPTIEST); lower goes first."""
+    return abs(2 * n_atoms - n_sites) if order == HALF_FILLED else order * n_atoms
+
+
+@helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, bool_[:, ::1], int64, int64[::1], int64[::1], int64)")
+def sort_row(plan: GrowingPlan, atoms: Bools, row: int, change: Ints, count: Ints, limit: int) -> GrowingPlan:
+    """Carry out an exchange in a row; updates ``atoms`` and ``count``."""
+    n_cols = len(change)
+    source = sites_of(atoms[row])
+    for col in range(n_cols):
+        if change[col] != 0:
+            atoms[row, col] = change[col] > 0
+            count[col] += change[col]
+    return add_line(plan, (True, row, n_cols), source, sites_of(atoms[row]), limit, 0)
 
 
 # What a rearrangement costs, the worst first.
@@ -151,7 +176,7 @@ def compress(
     return True
 
 
-@helper_kernel()
+@helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, {GRID}, {GRID}, {GRID}, int64, int64)")
 def compress_columns(
     plan: GrowingPlan, atoms: Bools, fill: Bools, clear: Bools, limit: int, slots: int
 ) -> GrowingPlan:
