@@ -308,7 +308,7 @@ def plan_fewest(
         row_limit: Maximum number of atoms in a batch that moves along a row.
         column_limit: Maximum number of atoms in a batch that moves along a column.
         slots: Ejection slots on each side.
-        order: Which of equal rows goes first: HALF_FILLED, FULLEST or EMPTIEST.
+        order: Which of equal rows goes first, see :func:`labseq_psca.kernels_lines.place_in_order`.
     """
     atoms = occupied.copy()
     other_atoms, other_fill, other_clear = transposed(occupied), transposed(fill), transposed(clear)

@@ -25,16 +25,18 @@ Ints = NDArray[np.int64]
 GRID: Final = const("bool_", 2)
 IMPOSSIBLE: Final = 1 << 60
 
-# Which of equal rows goes first: closest to half filled, or by a factor of its number of atoms.
-HALF_FILLED: Final = 0
-FULLEST: Final = -1
-EMPTIEST: Final = 1
+# Which of equal rows goes first, numbered as the setting row_order lists them.
+HALF_FILLED, FULLEST, EMPTIEST = range(3)
 
 
 @helper_kernel()
 def place_in_order(n_atoms: int, n_sites: int, order: int) -> int:
-    """Place of a row in an order (HALF_FILLED, FULLEST or EMPTIEST); lower goes first."""
-    return abs(2 * n_atoms - n_sites) if order == HALF_FILLED else order * n_atoms
+    """Place of a row in an order: the row with the lowest goes first."""
+    if order == FULLEST:
+        return -n_atoms
+    if order == EMPTIEST:
+        return n_atoms
+    return abs(2 * n_atoms - n_sites)
 
 
 @helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, bool_[:, ::1], int64, int64[::1], int64[::1], int64)")

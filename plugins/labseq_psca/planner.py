@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +17,7 @@ from labseq_psca.repair import Repair
 
 Kernel = Callable[..., FinishedPlan]
 RowOrder = Literal["half_filled", "fullest", "emptiest"]
+"""In the order of their numbers in ``kernels_lines``, whose ``place_in_order`` says what each is."""
 
 
 class ToneLimits(Settings):
@@ -88,8 +89,7 @@ class PscaPlanner:
         )
         self._settings = settings
         self._eject_slots = motion.eject_slots
-        # as in kernels_lines, which is not imported here: it takes numba
-        self._order = {"half_filled": 0, "fullest": -1, "emptiest": 1}[settings.row_order]
+        self._order = get_args(RowOrder).index(settings.row_order)
         self._grid = context.grid
         self._repair: Repair | None = None
         if settings.variant == "fewest" and settings.repair_below > 0:
