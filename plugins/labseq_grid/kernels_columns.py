@@ -26,12 +26,9 @@ EMPTY: Final = 0
 SPARE: Final = 1
 STAYS: Final = 2
 NOWHERE: Final = 1 << 20
-SITES: Final = "uint8[:, ::1]"
-NUMBERS: Final = "int64[::1]"
-TABLE: Final = "int64[:, ::1]"
 
 
-@helper_kernel("int64(int64)")
+@helper_kernel()
 def n_bits(pattern: int) -> int:
     """Count the bits of a pattern of at most 8 rows."""
     twos = pattern - ((pattern >> 1) & 0x55)
@@ -39,7 +36,7 @@ def n_bits(pattern: int) -> int:
     return (fours + (fours >> 4)) & 0xF
 
 
-@helper_kernel(f"int64({SITES}, {NUMBERS}, int64, int64)")
+@helper_kernel()
 def pattern_of(vacant: Bytes, rows: Ints, n: int, col: int) -> int:
     """The pattern of a column of sites that are 0 or 1."""
     pattern = 0
@@ -48,7 +45,7 @@ def pattern_of(vacant: Bytes, rows: Ints, n: int, col: int) -> int:
     return pattern
 
 
-@helper_kernel(f"void({SITES}, {NUMBERS}, int64, {TABLE})")
+@helper_kernel("void(uint8[:, ::1], int64[::1], int64, int64[:, ::1])")
 def find_spare(source: Bytes, rows: Ints, n: int, spare: Ints) -> None:
     """Fill ``spare`` for some source rows; a column with an atom that stays has no pattern."""
     n_cols = source.shape[1]
@@ -65,7 +62,7 @@ def find_spare(source: Bytes, rows: Ints, n: int, spare: Ints) -> None:
             spare[found, col] = col
 
 
-@helper_kernel(f"int64({TABLE}, int64, {SITES}, {NUMBERS}, int64, int64, {TABLE})")
+@helper_kernel("int64(int64[:, ::1], int64, uint8[:, ::1], int64[::1], int64, int64, int64[:, ::1])")
 def most_carried(spare: Ints, n: int, vacant: Bytes, goals: Ints, limit: int, most: int, end: Ints) -> int:
     """Find how many vacancies of the goal rows a batch can fill at most.
 
@@ -118,11 +115,10 @@ def most_carried(spare: Ints, n: int, vacant: Bytes, goals: Ints, limit: int, mo
 
 
 AFTER_ALL: Final = 1 << 14
-ENDS: Final = "int16[:, :, ::1]"
 Ends = NDArray[np.int16]
 
 
-@helper_kernel(f"void({TABLE}, {TABLE}, int64, int64, int64, {ENDS}, {TABLE})")
+@helper_kernel()
 def trace_back(
     spare: Ints, wanted: Ints, n_wanted: int, n_chosen: int, atoms: int, ends: Ends, chosen: Ints
 ) -> None:
@@ -143,7 +139,7 @@ def trace_back(
         chosen[0, taken - 1], chosen[1, taken - 1] = part, wanted[1, k]
 
 
-@helper_kernel(f"int64({TABLE}, int64, {SITES}, {NUMBERS}, int64, int64, {TABLE})")
+@helper_kernel("int64(int64[:, ::1], int64, uint8[:, ::1], int64[::1], int64, int64, int64[:, ::1])")
 def trace_columns(
     spare: Ints, n: int, vacant: Bytes, goals: Ints, limit: int, gain: int, chosen: Ints
 ) -> int:
@@ -162,7 +158,8 @@ def trace_columns(
         Number of columns, the fewest that carry as many.
     """
     n_cols = vacant.shape[1]
-    wanted, n_wanted = np.empty((2, n_cols), np.int64), 0
+    wanted = np.empty((2, n_cols), np.int64)
+    n_wanted = 0
     for col in range(n_cols):
         wanted[0, n_wanted], wanted[1, n_wanted] = pattern_of(vacant, goals, n, col), col
         n_wanted += wanted[0, n_wanted] != 0
@@ -187,7 +184,7 @@ def trace_columns(
     return n_chosen
 
 
-@helper_kernel(f"void({TABLE}, int64, {TABLE}, {TABLE})")
+@helper_kernel("void(int64[:, ::1], int64, int64[:, ::1], int64[:, ::1])")
 def take_nearest(spare: Ints, n_chosen: int, chosen: Ints, cost: Ints) -> None:
     """Choose source columns near their goals: of least sum of the squares of the ways.
 

@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import const, helper_kernel, kernel
+from labseq.plugin.plan_kernels import GROWING_PLAN, GrowingPlan, add_move, empty_plan, end_batch, finished
 from labseq_grid.kernels_columns import (
     EMPTY,
-    NUMBERS,
-    SITES,
     SPARE,
     STAYS,
-    TABLE,
     Bytes,
     Ints,
     find_spare,
@@ -32,6 +30,7 @@ from labseq_grid.kernels_rows import (
     ORIENTATION,
     SLACK,
     TO,
+    Candidates,
     try_rows,
 )
 
@@ -45,39 +44,48 @@ COMPARED_SITES: Final = 2000
 """Number of sites up to which all candidates that are kept are compared; above, fewer."""
 LEAST_COMPARED: Final = 6
 GRID: Final = const("bool_", 2)
-LIMITS: Final = "UniTuple(int64, 3)"
+
 Limits = tuple[int, int, int]
 """Maximum number of tweezers, row tones and column tones."""
-Chosen = tuple[int, int, Ints, Ints]
-"""Orientation, number of columns, source and goal rows, int64 (2, n), and columns, int64 (3, n_cols)."""
-CHOSEN: Final = f"Tuple((int64, int64, {TABLE}, {TABLE}))"
+Machine = tuple[Limits, int, bool, float]
+"""Limits; lines beyond the grid that the tones reach on each side; whether a tweezer without an atom may be
+ramped down on an atom; how far lanes swing, see :func:`labseq_grid.kernels_paths.add_travel`."""
+MACHINE: Final = "Tuple((UniTuple(int64, 3), int64, boolean, float64))"
+Sites = tuple[Bytes, Bytes, int]
+"""What each site holds (EMPTY, SPARE, STAYS or UNWANTED), and where an atom may be dropped off, both uint8;
+and how many lines outside of the grid they have on each side."""
+SITES: Final = "Tuple((uint8[:, ::1], uint8[:, ::1], int64))"
+Batch = tuple[int, Ints, Ints]
+"""Orientation; source and goal rows, int64 (2, n); pattern, goal and source of each column, int64 (3, m)."""
+Paths = tuple[NDArray[np.int32], Floats, NDArray[np.int32], int, int]
+"""path_shapes, path_positions and path_off of :class:`labseq.plugin.Plan`; how many of the last two."""
+PATHS: Final = "Tuple((int32[:, ::1], float64[::1], int32[::1], int64, int64))"
 
 
-@helper_kernel(f"int64({LIMITS}, int64, int64, int64)")
+@helper_kernel()
 def column_limit(limits: Limits, n: int, swapped: int, n_lines: int) -> int:
     """Maximum number of columns of a batch of ``n`` rows; a lane needs one line of ``n_lines`` free."""
     tones = limits[1] if swapped else limits[2]
     return min(limits[0] // n, tones, n_lines)
 
 
-@helper_kernel(f"int64({LIMITS}, int64, int64)")
+@helper_kernel()
 def row_limit(limits: Limits, swapped: int, n_lines: int) -> int:
     """Maximum number of rows of a batch."""
     tones = limits[2] if swapped else limits[1]
     return min(limits[0], tones, n_lines)
 
 
-@helper_kernel(f"int64({SITES}, {SITES}, {LIMITS}, int64, int64, {TABLE}, int64)")
-def find_candidates(
-    source: Bytes, vacant: Bytes, limits: Limits, slots: int, n_left: int, kept: Ints, n_beside: int
-) -> int:
-    """Find the best candidates of both orientations; ``n_beside``: lines outside of the grid."""
-    n_kept = 0
+@helper_kernel()
+def find_candidates(source: Bytes, vacant: Bytes, limits: Limits, spread: int, n_left: int) -> Candidates:
+    """Find the best candidates of both orientations.
+
+    ``spread`` is the number of lines that tones reach outside of ``source``, less one, for lanes.
+    """
+    candidates = np.empty((N_KEPT, CANDIDATE), np.int64), 0
     source_swapped, vacant_swapped = source.T.copy(), vacant.T.copy()
     lines, across = source.shape
-    spread = 2 * (slots - n_beside) - 1  # the lanes need a free line among those that the tones reach
-    most = min(MAX_ROWS, n_left)
-    for n in range(most, 0, -1):
+    for n in range(min(MAX_ROWS, n_left), 0, -1):
         for swapped in range(2):
             n_rows = (across if swapped else lines) + spread
             n_cols = (lines if swapped else across) + spread
@@ -85,14 +93,14 @@ def find_candidates(
             if limit < 1 or n > row_limit(limits, swapped, n_rows):
                 continue
             if swapped:
-                n_kept = try_rows(source_swapped, vacant_swapped, n, limit, 1, kept, n_kept, n_left)
+                candidates = try_rows(candidates, source_swapped, vacant_swapped, n, limit, 1, n_left)
             else:
-                n_kept = try_rows(source, vacant, n, limit, 0, kept, n_kept, n_left)
-    return n_kept
+                candidates = try_rows(candidates, source, vacant, n, limit, 0, n_left)
+    return candidates
 
 
-@helper_kernel(f"{CHOSEN}({SITES}, {SITES}, {LIMITS}, int64, {NUMBERS})")
-def complete(source: Bytes, vacant: Bytes, limits: Limits, n_lines: int, candidate: Ints) -> Chosen:
+@helper_kernel()
+def complete(source: Bytes, vacant: Bytes, limits: Limits, n_lines: int, candidate: Ints) -> Batch:
     """Choose the columns of a candidate; ``source`` and ``vacant`` are in its orientation."""
     n, swapped, atoms = candidate[N_ROWS], candidate[ORIENTATION], candidate[ATOMS]
     n_cols = source.shape[1]
@@ -101,28 +109,29 @@ def complete(source: Bytes, vacant: Bytes, limits: Limits, n_lines: int, candida
     limit = min(column_limit(limits, n, swapped, n_lines), atoms)
     spare = np.empty((1 << n, n_cols + 1), np.int64)
     find_spare(source, rows[0], n, spare)
-    chosen = np.empty((3, n_cols), np.int64)
-    m = trace_columns(spare, n, vacant, rows[1], limit, atoms, chosen)
-    take_nearest(spare, m, chosen, np.empty((m + 1, n_cols + 1), np.int64))
-    return swapped, m, rows, chosen
+    columns = np.empty((3, n_cols), np.int64)
+    m = trace_columns(spare, n, vacant, rows[1], limit, atoms, columns)
+    take_nearest(spare, m, columns, np.empty((m + 1, n_cols + 1), np.int64))
+    return swapped, rows, columns[:, :m].copy()
 
 
-@helper_kernel(f"int64({CHOSEN}, {TABLE})")
-def list_moves(chosen: Chosen, moves: Ints) -> int:
-    """List the atom moves of a batch as (row, column, to row, to column); return how many."""
-    swapped, m, rows, columns = chosen
-    count = 0
+@helper_kernel()
+def list_moves(batch: Batch) -> Ints:
+    """List the atom moves of a batch, int64 (n, 4): (row, column, to row, to column)."""
+    swapped, rows, columns = batch
+    moves = np.empty((rows.shape[1] * columns.shape[1], 4), np.int64)
+    n = 0
     for i in range(rows.shape[1]):
-        for j in range(m):
+        for j in range(columns.shape[1]):
             if columns[0, j] >> i & 1:
                 at, to = (rows[0, i], columns[2, j]), (rows[1, i], columns[1, j])
-                moves[count, 0], moves[count, 1] = (at[1], at[0]) if swapped else at
-                moves[count, 2], moves[count, 3] = (to[1], to[0]) if swapped else to
-                count += 1
-    return count
+                moves[n, 0], moves[n, 1] = (at[1], at[0]) if swapped else at
+                moves[n, 2], moves[n, 3] = (to[1], to[0]) if swapped else to
+                n += 1
+    return moves[:n]
 
 
-@helper_kernel(f"float64({SITES})")
+@helper_kernel()
 def scatter(marks: Bytes) -> float:
     """How scattered marked sites are: each counts one over the number of them in its row or column."""
     n_rows, n_cols = marks.shape
@@ -139,122 +148,24 @@ def scatter(marks: Bytes) -> float:
     return total
 
 
-@helper_kernel(f"float64({SITES}, {TABLE}, int64, boolean, {SITES})")
-def worth(kind: Bytes, moves: Ints, n: int, fills: bool, marks: Bytes) -> float:
-    """Worth of a batch of ``n`` moves: atoms carried, less ways and the scatter of what is left.
+@helper_kernel()
+def worth(sites: Sites, moves: Ints, fills: bool) -> float:
+    """Worth of a batch: atoms carried, less their ways and the scatter of what it leaves.
 
-    ``marks`` is changed: the vacancies left if the batch ``fills``, else the unwanted atoms left.
+    It leaves vacancies if the batch ``fills``, else unwanted atoms.
     """
-    total = float(n)
-    for i in range(n):
+    kind, vacant, _ = sites
+    marks = vacant.copy() if fills else (kind == UNWANTED).astype(np.uint8)
+    side = 2 if fills else 0
+    way, total = 0, float(len(moves))
+    for i in range(len(moves)):
         total += kind[moves[i, 0], moves[i, 1]] == UNWANTED
-        side = 2 if fills else 0
         marks[moves[i, side], moves[i, side + 1]] = 0
-    way = 0
-    for i in range(n):
         way += abs(moves[i, 2] - moves[i, 0]) + abs(moves[i, 3] - moves[i, 1])
     return total - SCATTER * scatter(marks) - WAY * way
 
 
-Growing = tuple[NDArray[np.int16], NDArray[np.int32], NDArray[np.int32], Floats, NDArray[np.int32]]
-"""moves, batch offsets, path shapes, path positions, path off of :class:`labseq.plugin.Plan`."""
-GROWING: Final = "Tuple((int16[:, ::1], int32[::1], int32[:, ::1], float64[::1], int32[::1]))"
-Ends = tuple[int, int, int]
-"""Number of batches, of positions and of knots so far."""
-
-
-@helper_kernel(
-    f"UniTuple(int64, 3)({GROWING}, UniTuple(int64, 3), {SITES}, int64, int64, {CHOSEN}, boolean, float64)"
-)
-def add_batch(
-    plan: Growing,
-    ends: Ends,
-    kind: Bytes,
-    n_beside: int,
-    slots: int,
-    chosen: Chosen,
-    may_land: bool,
-    weave: float,
-) -> Ends:
-    """Add a batch to the plan: its atom moves and the paths of its tones.
-
-    ``kind`` begins ``n_beside`` lines outside of the grid.
-    """
-    moves, offsets, shapes, positions, off = plan
-    n_batches, n_positions, n_off = ends
-    swapped, m, rows, columns = chosen
-    carried = np.empty((rows.shape[1] * m, 4), np.int64)
-    n = list_moves(chosen, carried)
-    start = offsets[n_batches]
-    for i in range(n):
-        for k in range(4):
-            moves[start + i, k] = carried[i, k] - n_beside
-    offsets[n_batches + 1] = start + n
-    used = np.zeros(rows.shape[1], np.bool_)
-    for i in range(len(used)):
-        for j in range(m):
-            used[i] = used[i] or columns[0, j] >> i & 1
-    row, to_row = rows[0][used], rows[1][used]
-    bit = np.flatnonzero(used)
-    n_rows = len(row)
-    free = np.empty((2 * n_rows, m), np.bool_)
-    for i in range(n_rows):
-        for j in range(m):
-            r, c = (columns[1, j], to_row[i]) if swapped else (to_row[i], columns[1, j])
-            free[i, j] = columns[0, j] >> bit[i] & 1
-            free[n_rows + i, j] = free[i, j] or kind[r, c] == EMPTY
-    lines = kind.shape[1] if swapped else kind.shape[0]
-    across = kind.shape[0] if swapped else kind.shape[1]
-    most = max_knots(lines + 2 * slots, across + 2 * slots)
-    row_path, column_path = np.empty((most, n_rows)), np.empty((most, m))
-    goes_off = np.empty(n_rows, np.int64)
-    n_knots = find_paths(
-        row - n_beside,
-        to_row - n_beside,
-        columns[2, :m] - n_beside,
-        columns[1, :m] - n_beside,
-        free,
-        lines - 2 * n_beside,
-        across - 2 * n_beside,
-        slots,
-        not may_land,
-        weave,
-        row_path,
-        column_path,
-        goes_off,
-    )
-    shapes[n_batches] = n_knots, m if swapped else n_rows, n_rows if swapped else m
-    for part in range(2):
-        path = column_path if (part == 1) != (swapped == 1) else row_path
-        n_tones = path.shape[1]
-        for knot in range(n_knots):
-            for tone in range(n_tones):
-                positions[n_positions] = path[knot, tone]
-                n_positions += 1
-        for tone in range(n_tones):
-            off[n_off] = n_knots - 1
-            if (part == 0) == (swapped == 0):
-                off[n_off] = goes_off[tone]
-            n_off += 1
-    return n_batches + 1, n_positions, n_off
-
-
-@helper_kernel(f"int64({SITES}, {SITES}, {CHOSEN}, int64)")
-def carry_out(kind: Bytes, vacant: Bytes, chosen: Chosen, n_beside: int) -> int:
-    """Update the sites after a batch; return how many atoms it carried."""
-    moves = np.empty((chosen[2].shape[1] * chosen[1], 4), np.int64)
-    n = list_moves(chosen, moves)
-    n_rows, n_cols = kind.shape
-    for i in range(n):
-        row, col = moves[i, 2], moves[i, 3]
-        kind[moves[i, 0], moves[i, 1]] = EMPTY
-        if n_beside <= row < n_rows - n_beside and n_beside <= col < n_cols - n_beside:
-            kind[row, col] = STAYS
-            vacant[row, col] = 0
-    return n
-
-
-@helper_kernel(f"void({SITES}, boolean, boolean, {SITES})")
+@helper_kernel()
 def find_sources(kind: Bytes, fills: bool, only_unwanted: bool, source: Bytes) -> None:
     """Mark atoms that may be carried as SPARE and the others as STAYS."""
     for row in range(kind.shape[0]):
@@ -264,91 +175,125 @@ def find_sources(kind: Bytes, fills: bool, only_unwanted: bool, source: Bytes) -
             source[row, col] = EMPTY if atom == EMPTY else SPARE if spare else STAYS
 
 
+@helper_kernel()
+def best_batch(sites: Sites, machine: Machine, fills: bool, n_left: int) -> Batch:
+    """Compare the candidates that carry most atoms, at most ``n_left``; no columns if none carries any."""
+    kind, vacant, n_beside = sites
+    limits, slots, _, _ = machine
+    source = np.empty_like(kind)
+    spread = 2 * (slots - n_beside) - 1
+    n_compared = max(LEAST_COMPARED, N_KEPT * COMPARED_SITES // kind.size)
+    best, most = (0, np.empty((2, 0), np.int64), np.empty((3, 0), np.int64)), -1e300
+    for only_unwanted in range(2 if fills and (kind == UNWANTED).any() else 1):
+        find_sources(kind, fills, only_unwanted == 1, source)
+        kept, n_kept = find_candidates(source, vacant, limits, spread, n_left)
+        source_swapped, vacant_swapped = source.T.copy(), vacant.T.copy()
+        for i in range(min(n_kept, n_compared)):
+            if kept[i, ATOMS] < kept[0, ATOMS] - SLACK:
+                break
+            if kept[i, ORIENTATION]:
+                batch = complete(source_swapped, vacant_swapped, limits, kind.shape[0] + spread, kept[i])
+            else:
+                batch = complete(source, vacant, limits, kind.shape[1] + spread, kept[i])
+            value = worth(sites, list_moves(batch), fills)
+            if value > most:
+                best, most = batch, value
+    return best
+
+
+@helper_kernel()
+def paths_of(sites: Sites, machine: Machine, batch: Batch) -> tuple[Floats, Floats, Ints]:
+    """Find the paths of a batch's tones, see :func:`labseq_grid.kernels_paths.find_paths`."""
+    kind, _, n_beside = sites
+    _, slots, may_land, weave = machine
+    swapped, rows, columns = batch
+    used = np.zeros(rows.shape[1], np.bool_)  # a row of which no column takes an atom needs no tone
+    for i in range(len(used)):
+        used[i] = (columns[0] >> i & 1).any()
+    bits = np.flatnonzero(used)
+    n, m = len(bits), columns.shape[1]
+    carried, free = np.empty((n, m), np.bool_), np.empty((n, m), np.bool_)
+    for i in range(n):
+        for j in range(m):
+            row, col = rows[1, bits[i]], columns[1, j]
+            r, c = (col, row) if swapped else (row, col)
+            carried[i, j] = columns[0, j] >> bits[i] & 1
+            free[i, j] = carried[i, j] or kind[r, c] == EMPTY
+    lines, across = (kind.shape[1], kind.shape[0]) if swapped else kind.shape
+    last = slots - 2 * n_beside - 1
+    row, to_row = rows[0][used] - n_beside, rows[1][used] - n_beside
+    column, to_column = columns[2] - n_beside, columns[1] - n_beside
+    band = (-slots, lines + last, -slots, across + last)
+    return find_paths((row, to_row), (column, to_column), (carried, free), band, not may_land, weave)
+
+
+@helper_kernel()
+def add_axis(paths: Paths, positions: Floats, goes_off: Ints) -> Paths:
+    """Add paths of the n tones of an axis, float64 (n_knots, n), and where each goes off, int64 (n,)."""
+    shapes, all_positions, off, n_positions, n_off = paths
+    stop, off_stop = n_positions + positions.size, n_off + len(goes_off)
+    all_positions[n_positions:stop] = positions.reshape(-1)
+    off[n_off:off_stop] = goes_off
+    return shapes, all_positions, off, stop, off_stop
+
+
+@helper_kernel()
+def add_batch(
+    plan: GrowingPlan, paths: Paths, sites: Sites, machine: Machine, batch: Batch
+) -> tuple[GrowingPlan, Paths]:
+    """Add a batch: its atom moves and the paths of its tones."""
+    row_path, column_path, goes_off = paths_of(sites, machine, batch)
+    n_knots = len(row_path)
+    stays_on = np.full(column_path.shape[1], n_knots - 1)  # the columns are ramped down with the last row
+    if batch[0]:
+        paths[0][plan[3]] = n_knots, column_path.shape[1], row_path.shape[1]
+        paths = add_axis(add_axis(paths, column_path, stays_on), row_path, goes_off)
+    else:
+        paths[0][plan[3]] = n_knots, row_path.shape[1], column_path.shape[1]
+        paths = add_axis(add_axis(paths, row_path, goes_off), column_path, stays_on)
+    moves = list_moves(batch) - sites[2]
+    for i in range(len(moves)):
+        plan = add_move(plan, moves[i, 0], moves[i, 1], moves[i, 2], moves[i, 3])
+    return end_batch(plan, False), paths
+
+
+@helper_kernel()
+def carry_out(sites: Sites, moves: Ints) -> None:
+    """Update the sites after a batch."""
+    kind, vacant, n_beside = sites
+    n_rows, n_cols = kind.shape
+    for i in range(len(moves)):
+        row, col = moves[i, 2], moves[i, 3]
+        kind[moves[i, 0], moves[i, 1]] = EMPTY
+        if n_beside <= row < n_rows - n_beside and n_beside <= col < n_cols - n_beside:
+            kind[row, col] = STAYS
+            vacant[row, col] = 0
+
+
 @helper_kernel(
-    f"UniTuple(int64, 3)({GROWING}, UniTuple(int64, 3), {SITES}, {SITES}, {LIMITS}, int64, int64, boolean, "
-    "boolean, int64, float64)"
+    f"Tuple(({GROWING_PLAN}, {PATHS}))({GROWING_PLAN}, {PATHS}, {SITES}, {MACHINE}, boolean, int64)"
 )
 def add_batches(
-    plan: Growing,
-    ends: Ends,
-    kind: Bytes,
-    vacant: Bytes,
-    limits: Limits,
-    n_beside: int,
-    slots: int,
-    may_land: bool,
-    fills: bool,
-    n_left: int,
-    weave: float,
-) -> Ends:
-    """Add batches until ``n_left`` atoms have been carried, or no more can be."""
-    source = np.empty_like(kind)
-    kept = np.empty((N_KEPT, CANDIDATE), np.int64)
-    n_unwanted = np.count_nonzero(kind == UNWANTED)
-    n_compared = max(LEAST_COMPARED, N_KEPT * COMPARED_SITES // kind.size)
+    plan: GrowingPlan, paths: Paths, sites: Sites, machine: Machine, fills: bool, n_left: int
+) -> tuple[GrowingPlan, Paths]:
+    """Add batches until ``n_left`` atoms have been carried, or no more can be; updates ``sites``."""
     while n_left > 0:
-        best = -1e300
-        chosen = (0, 0, np.empty((2, 0), np.int64), np.empty((3, 0), np.int64))
-        for only_unwanted in range(2 if fills and n_unwanted > 0 else 1):
-            find_sources(kind, fills, only_unwanted == 1, source)
-            n_kept = find_candidates(source, vacant, limits, slots, n_left, kept, n_beside)
-            source_swapped, vacant_swapped = source.T.copy(), vacant.T.copy()
-            for i in range(n_kept):
-                if kept[i, ATOMS] < kept[0, ATOMS] - SLACK or i >= n_compared:
-                    break
-                swapped = kept[i, ORIENTATION]
-                n_lines = kind.shape[0 if swapped else 1] + 2 * (slots - n_beside) - 1
-                if swapped:
-                    found = complete(source_swapped, vacant_swapped, limits, n_lines, kept[i])
-                else:
-                    found = complete(source, vacant, limits, n_lines, kept[i])
-                moves = np.empty((found[2].shape[1] * found[1], 4), np.int64)
-                n = list_moves(found, moves)
-                marks = vacant.copy() if fills else (kind == UNWANTED).astype(np.uint8)
-                value = worth(kind, moves, n, fills, marks)
-                if value > best:
-                    best = value
-                    chosen = found
-        if chosen[1] == 0:
+        batch = best_batch(sites, machine, fills, n_left)
+        if batch[2].shape[1] == 0:
             break
-        ends = add_batch(plan, ends, kind, n_beside, slots, chosen, may_land, weave)
-        n_left -= carry_out(kind, vacant, chosen, n_beside)
-        n_unwanted = np.count_nonzero(kind == UNWANTED)
-    return ends
+        plan, paths = add_batch(plan, paths, sites, machine, batch)
+        moves = list_moves(batch)
+        carry_out(sites, moves)
+        n_left -= len(moves)
+    return plan, paths
 
 
-@kernel(f"{GROWING}({GRID}, {GRID}, {GRID}, {GRID}, {LIMITS}, int64, boolean, float64)")
-def plan_grid(
-    occupied: Bools,
-    fill: Bools,
-    wanted: Bools,
-    clear: Bools,
-    limits: Limits,
-    slots: int,
-    may_land: bool,
-    weave: float,
-) -> Growing:
-    """Plan all batches: fill vacancies, then bring unwanted atoms to the reservoir, then eject the rest.
-
-    Args:
-        occupied: bool (n_rows, n_cols).
-        fill: The same shape, sites that must hold an atom; no more than there are atoms.
-        wanted: The same shape, sites of the whole target.
-        clear: The same shape, sites that must be empty.
-        limits: Maximum number of tweezers, row tones and column tones.
-        slots: Lines beyond the grid that the tones reach on each side.
-        may_land: Whether a tweezer without an atom may be ramped down on an atom.
-        weave: How far lanes swing, see :func:`labseq_grid.kernels_paths.add_travel`.
-
-    Returns:
-        The arrays of a :class:`labseq.plugin.Plan`, without ``linked``.
-    """
+@helper_kernel()
+def read_sites(occupied: Bools, fill: Bools, clear: Bools, n_beside: int) -> Sites:
+    """Sort atoms and vacancies, with ``n_beside`` lines around the grid."""
     n_rows, n_cols = occupied.shape
-    n_unwanted = np.count_nonzero(occupied & clear)
-    n_beside = slots if n_unwanted > 0 else 0
     shape = (n_rows + 2 * n_beside, n_cols + 2 * n_beside)
     kind, vacant = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
-    n_vacant = 0
     for row in range(n_rows):
         for col in range(n_cols):
             at = row + n_beside, col + n_beside
@@ -356,37 +301,71 @@ def plan_grid(
                 kind[at] = STAYS if fill[row, col] else UNWANTED if clear[row, col] else SPARE
             elif fill[row, col]:
                 vacant[at] = 1
-                n_vacant += 1
+    return kind, vacant, n_beside
+
+
+@helper_kernel()
+def open_reservoir(sites: Sites, kept_free: Bools) -> None:
+    """Let atoms be dropped off where there are none, except on the sites that are ``kept_free``."""
+    kind, vacant, n_beside = sites
+    vacant[:] = 0
+    for row in range(kept_free.shape[0]):
+        for col in range(kept_free.shape[1]):
+            at = row + n_beside, col + n_beside
+            vacant[at] = not kept_free[row, col] and kind[at] == EMPTY
+
+
+@helper_kernel()
+def open_outside(sites: Sites) -> None:
+    """Let atoms be dropped off outside of the grid, and nowhere else."""
+    _, vacant, n_beside = sites
+    n_rows, n_cols = vacant.shape
+    vacant[:] = 1
+    vacant[n_beside : n_rows - n_beside, n_beside : n_cols - n_beside] = 0
+
+
+@kernel(
+    "Tuple((int16[:, ::1], int32[::1], bool_[::1], int32[:, ::1], float64[::1], int32[::1]))"
+    f"({GRID}, {GRID}, {GRID}, {GRID}, {MACHINE})"
+)
+def plan_grid(
+    occupied: Bools, fill: Bools, wanted: Bools, clear: Bools, machine: Machine
+) -> tuple[NDArray[np.generic], ...]:
+    """Plan all batches: fill vacancies, then bring unwanted atoms to the reservoir, then eject the rest.
+
+    Args:
+        occupied: bool (n_rows, n_cols).
+        fill: The same shape, sites that must hold an atom; no more than there are atoms.
+        wanted: The same shape, sites of the whole target.
+        clear: The same shape, sites that must be empty.
+        machine: See :data:`Machine`.
+
+    Returns:
+        The arrays of a :class:`labseq.plugin.Plan`.
+    """
+    n_rows, n_cols = occupied.shape
+    slots = machine[1]
+    n_unwanted = int(np.count_nonzero(occupied & clear))
+    n_vacant = int(np.count_nonzero(fill & ~occupied))
+    sites = read_sites(occupied, fill, clear, slots if n_unwanted > 0 else 0)
     n_most = n_vacant + n_unwanted
-    plan = (
-        np.empty((n_most, 4), np.int16),
-        np.zeros(n_most + 1, np.int32),
+    plan = empty_plan(n_most)
+    paths = (
         np.empty((n_most, 3), np.int32),
         np.empty(2 * max_knots(n_rows + 2 * slots, n_cols + 2 * slots) * n_most),
         np.empty(2 * n_most, np.int32),
+        0,
+        0,
     )
-    ends = add_batches(
-        plan, (0, 0, 0), kind, vacant, limits, n_beside, slots, may_land, True, n_vacant, weave
-    )
-    for outside in range(2 if n_unwanted > 0 else 0):
-        vacant[:] = 0
-        for row in range(shape[0]):
-            for col in range(shape[1]):
-                r, c = row - n_beside, col - n_beside
-                on_grid = 0 <= r < n_rows and 0 <= c < n_cols
-                if outside:
-                    vacant[row, col] = not on_grid
-                elif on_grid and not (wanted[r, c] or clear[r, c]):
-                    vacant[row, col] = kind[row, col] == EMPTY
-        n_left = int(np.count_nonzero(kind == UNWANTED))
-        ends = add_batches(plan, ends, kind, vacant, limits, n_beside, slots, may_land, False, n_left, weave)
-    n_batches, n_positions, n_off = ends
-    moves, offsets, shapes, positions, off = plan
-    n_moves = offsets[n_batches]
-    return (
-        moves[:n_moves].copy(),
-        offsets[: n_batches + 1].copy(),
-        shapes[:n_batches].copy(),
-        positions[:n_positions].copy(),
-        off[:n_off].copy(),
-    )
+    plan, paths = add_batches(plan, paths, sites, machine, True, n_vacant)
+    if n_unwanted > 0:
+        open_reservoir(sites, wanted | clear)
+        n_left = int(np.count_nonzero(sites[0] == UNWANTED))
+        plan, paths = add_batches(plan, paths, sites, machine, False, n_left)
+        open_outside(sites)
+        n_left = int(np.count_nonzero(sites[0] == UNWANTED))
+        plan, paths = add_batches(plan, paths, sites, machine, False, n_left)
+    moves, offsets, linked = finished(plan)
+    shapes, positions, off, n_positions, n_off = paths
+    path_arrays = shapes[: plan[3]].copy(), positions[:n_positions].copy(), off[:n_off].copy()
+    return moves, offsets, linked, path_arrays[0], path_arrays[1], path_arrays[2]

@@ -14,10 +14,7 @@ import numpy as np
 
 from labseq.plugin import helper_kernel
 from labseq_grid.kernels_columns import (
-    NUMBERS,
-    SITES,
     SPARE,
-    TABLE,
     Bytes,
     Ints,
     find_spare,
@@ -49,8 +46,12 @@ FROM: Final = 3
 TO: Final = FROM + MAX_ROWS
 CANDIDATE: Final = TO + MAX_ROWS
 
+Candidates = tuple[Ints, int]
+"""int64 (N_KEPT, CANDIDATE), the candidates, the best first; and how many there are."""
+CANDIDATES: Final = "Tuple((int64[:, ::1], int64))"
 
-@helper_kernel(f"void({SITES}, uint8, {NUMBERS})")
+
+@helper_kernel()
 def count_sites(sites: Bytes, value: int, counts: Ints) -> None:
     """Count the sites of a value in each row."""
     for row in range(sites.shape[0]):
@@ -59,7 +60,7 @@ def count_sites(sites: Bytes, value: int, counts: Ints) -> None:
             counts[row] += sites[row, col] == value
 
 
-@helper_kernel("int64(int64, int64)")
+@helper_kernel()
 def n_choices(n_rows: int, n: int) -> int:
     """Number of choices of ``n`` of ``n_rows`` rows, n up to 3."""
     if n == 1:
@@ -69,7 +70,7 @@ def n_choices(n_rows: int, n: int) -> int:
     return n_rows * (n_rows - 1) * (n_rows - 2) // 6
 
 
-@helper_kernel(f"int64({NUMBERS}, int64, {NUMBERS})")
+@helper_kernel()
 def richest_rows(counts: Ints, n_most: int, rows: Ints) -> int:
     """List the rows with the highest counts above 0, in ascending order; return how many."""
     n = 0
@@ -91,7 +92,7 @@ def richest_rows(counts: Ints, n_most: int, rows: Ints) -> int:
     return n
 
 
-@helper_kernel(f"int64({NUMBERS}, int64, int64, {TABLE})")
+@helper_kernel()
 def choices(rows: Ints, n_rows: int, n: int, chosen: Ints) -> int:
     """List all choices of ``n`` of some rows, n up to 3, in ``chosen``; return how many."""
     count = 0
@@ -111,7 +112,7 @@ def choices(rows: Ints, n_rows: int, n: int, chosen: Ints) -> int:
     return count
 
 
-@helper_kernel(f"int64({SITES}, {NUMBERS}, int64, int64, uint8)")
+@helper_kernel()
 def bound(sites: Bytes, rows: Ints, n: int, limit: int, value: int) -> int:
     """Count the sites of a value in up to 3 rows, in the ``limit`` columns with most of them."""
     n_cols = sites.shape[1]
@@ -134,7 +135,7 @@ def bound(sites: Bytes, rows: Ints, n: int, limit: int, value: int) -> int:
     return min(one, limit) + min(two, limit) + min(three, limit)
 
 
-@helper_kernel(f"{NUMBERS}({SITES}, {TABLE}, int64, int64, uint8)")
+@helper_kernel()
 def bounds(sites: Bytes, chosen: Ints, n: int, limit: int, value: int) -> Ints:
     """The bound of each choice of rows, see :func:`bound`."""
     found = np.empty(len(chosen), np.int64)
@@ -143,50 +144,49 @@ def bounds(sites: Bytes, chosen: Ints, n: int, limit: int, value: int) -> Ints:
     return found
 
 
-@helper_kernel(f"int64({TABLE}, int64, int64, int64, {NUMBERS}, {NUMBERS}, int64)")
-def keep(kept: Ints, n_kept: int, atoms: int, orientation: int, source: Ints, goal: Ints, n: int) -> int:
-    """Add a candidate to those that are kept, the best first; return their number."""
+@helper_kernel()
+def keep(candidates: Candidates, atoms: int, orientation: int, source: Ints, goal: Ints) -> Candidates:
+    """Add a candidate to those that are kept."""
+    kept, n_kept = candidates
     if n_kept == N_KEPT:
         if atoms <= kept[N_KEPT - 1, ATOMS]:
-            return n_kept
+            return candidates
         n_kept -= 1
     place = n_kept
     while place > 0 and kept[place - 1, ATOMS] < atoms:
         kept[place] = kept[place - 1]
         place -= 1
+    n = len(source)
     kept[place, ATOMS], kept[place, ORIENTATION], kept[place, N_ROWS] = atoms, orientation, n
-    for i in range(n):
-        kept[place, FROM + i], kept[place, TO + i] = source[i], goal[i]
-    return n_kept + 1
+    kept[place, FROM : FROM + n] = source
+    kept[place, TO : TO + n] = goal
+    return kept, n_kept + 1
 
 
-@helper_kernel(f"int64({TABLE}, int64)")
-def worth_keeping(kept: Ints, n_kept: int) -> int:
+@helper_kernel()
+def worth_keeping(candidates: Candidates) -> int:
     """Least number of atoms of a candidate that would be kept."""
+    kept, n_kept = candidates
     if n_kept == 0:
         return 1
     least = max(1, kept[0, ATOMS] - SLACK)
     return max(least, kept[N_KEPT - 1, ATOMS] + 1) if n_kept == N_KEPT else least
 
 
-@helper_kernel(f"int64({SITES}, {SITES}, int64, int64, int64, {TABLE}, int64, int64)")
+@helper_kernel(f"{CANDIDATES}({CANDIDATES}, uint8[:, ::1], uint8[:, ::1], int64, int64, int64, int64)")
 def try_rows(
-    source: Bytes, vacant: Bytes, n: int, limit: int, orientation: int, kept: Ints, n_kept: int, n_left: int
-) -> int:
+    candidates: Candidates, source: Bytes, vacant: Bytes, n: int, limit: int, orientation: int, n_left: int
+) -> Candidates:
     """Add the best candidates of ``n`` rows, n up to 3, to those that are kept.
 
     Args:
+        candidates: Those that are kept.
         source: uint8 (n_rows, n_cols), see :mod:`labseq_grid.kernels_columns`.
         vacant: The same shape.
         n: Number of rows.
         limit: Maximum number of columns.
         orientation: What the candidates are marked with.
-        kept: int64 (N_KEPT, CANDIDATE), the candidates, the best first.
-        n_kept: Number of candidates.
         n_left: Number of atoms after which the search is over.
-
-    Returns:
-        Number of candidates.
     """
     n_rows, n_cols = source.shape
     counts, rows = np.empty(n_rows, np.int64), np.empty(n_rows, np.int64)
@@ -199,7 +199,7 @@ def try_rows(
     tos = np.empty((n_choices(n_goals, n), MAX_ROWS), np.int64)
     n_tos = choices(rows, n_goals, n, tos)
     if n_froms == 0 or n_tos == 0:
-        return n_kept
+        return candidates
     from_bounds, to_bounds = bounds(source, froms, n, limit, SPARE), bounds(vacant, tos, n, limit, 1)
     highest = to_bounds.max()
     spare = np.empty((n_froms, 1 << n, n_cols + 1), np.int64)
@@ -212,19 +212,20 @@ def try_rows(
                 continue
             for i in range(n_froms):
                 most = min(level, from_bounds[i], n_left)
-                if most < worth_keeping(kept, n_kept):
+                if most < worth_keeping(candidates):
                     continue
                 if not has_spare[i]:
                     find_spare(source, froms[i], n, spare[i])
                     has_spare[i] = True
                 atoms = most_carried(spare[i], n, vacant, tos[k], limit, most, end)
-                if atoms >= worth_keeping(kept, n_kept):
-                    n_kept = keep(kept, n_kept, atoms, orientation, froms[i], tos[k], n)
+                if atoms >= worth_keeping(candidates):
+                    candidates = keep(candidates, atoms, orientation, froms[i, :n], tos[k, :n])
                 n_trials += 1
                 work += n_cols * limit * most
+                kept, n_kept = candidates
                 is_complete = n_kept > 0 and kept[0, ATOMS] == n_left
                 if n_trials == TRIALS or work > WORK or is_complete:
-                    return n_kept
-        if level <= worth_keeping(kept, n_kept):  # the next level is lower
+                    return candidates
+        if level <= worth_keeping(candidates):  # the next level is lower
             break
-    return n_kept
+    return candidates

@@ -23,6 +23,7 @@ from labseq.plugin import (
     as_occupancy,
 )
 from labseq.plugin.geometry import nearest_to_centre
+from labseq.plugin.plan_kernels import as_plan
 
 
 class GridSettings(Settings):
@@ -143,11 +144,10 @@ class GridPlanner:
             if settings.without_lanes == "refuse":
                 raise
             self._in_lines = PscaPlanner(PscaSettings(degree_of_parallelism=dop), context)
-        self._limits = dop, motion.max_row_tones, motion.max_column_tones
-        self._slots = motion.eject_slots
-        self._may_land = motion.empty_tweezers_may_land
         self._grid = context.grid
-        self._weave = lane_weave(context.grid, motion) if settings.lanes == "weaving" else 0.0
+        limits = dop, motion.max_row_tones, motion.max_column_tones
+        weave = lane_weave(context.grid, motion) if settings.lanes == "weaving" else 0.0
+        self._machine = limits, motion.eject_slots, motion.empty_tweezers_may_land, weave
 
     @cached_property
     def _kernel(self) -> Callable[..., Any]:
@@ -186,10 +186,4 @@ class GridPlanner:
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), "grid") from error
         fill = nearest_to_centre(target.fill, int(np.count_nonzero(occupied)), self._grid)
-        arrays = self._kernel(
-            occupied, fill, target.fill, target.clear, self._limits, self._slots, self._may_land, self._weave
-        )
-        for array in arrays:
-            array.flags.writeable = False  # otherwise Plan would copy them
-        moves, offsets, *paths = arrays
-        return Plan(moves, offsets, np.zeros(len(offsets) - 1, np.bool_), *paths)
+        return as_plan(self._kernel(occupied, fill, target.fill, target.clear, self._machine))
