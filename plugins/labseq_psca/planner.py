@@ -131,12 +131,11 @@ class PscaPlanner:
             atoms = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), "psca") from error
-        plan = self._sort_and_compress(atoms, target)
-        if self._repair is None:
-            return plan
-        return self._repair.improve(plan, atoms, target, lambda after: self._sort_and_compress(after, target))
-
-    def _sort_and_compress(self, atoms: Occupancy, target: TargetPattern) -> Plan:
         fill = nearest_to_centre(target.fill, int(np.count_nonzero(atoms)), self._grid)
-        limits = *self._limits, self._eject_slots, self._order
-        return as_plan(self._kernel(atoms, fill, target.clear, *limits))
+
+        def sort_and_compress(atoms: Occupancy) -> Plan:
+            limits = *self._limits, self._eject_slots, self._order
+            return as_plan(self._kernel(atoms, fill, target.clear, *limits))
+
+        plan = sort_and_compress(atoms)
+        return self._repair.improve(plan, atoms, fill, target, sort_and_compress) if self._repair else plan

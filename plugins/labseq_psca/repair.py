@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, ValidationError
 
 from labseq.plugin import (
@@ -68,17 +68,22 @@ class Repair:
         importlib.import_module("labseq_psca.kernels_repair")
 
     def improve(
-        self, plan: Plan, atoms: Occupancy, target: TargetPattern, plan_rest: Callable[[Occupancy], Plan]
+        self,
+        plan: Plan,
+        atoms: Occupancy,
+        fill: NDArray[np.bool_],
+        target: TargetPattern,
+        plan_rest: Callable[[Occupancy], Plan],
     ) -> Plan:
         """Return the plan after which the target is more probably whole: the given one, or a repair.
 
         Args:
             plan: Another planner's plan.
             atoms: bool (n_rows, n_cols), as detected.
+            fill: The same shape, the fill sites of the target that the atoms suffice for.
             target: The pattern to make, of the same shape.
             plan_rest: Called with the occupancy after the repair: plans what the repair leaves.
         """
-        fill = nearest_to_centre(target.fill, int(np.count_nonzero(atoms)), self._grid)
         n_defects = int(np.count_nonzero(fill > atoms))
         if not 0 < n_defects <= self._below * target.n_atoms:
             return plan
@@ -113,14 +118,10 @@ def joined(first: Plan, then: Plan) -> Plan:
     shapes = then.path_shapes
     if len(shapes):
         shapes = np.concatenate([np.zeros((first.n_batches, 3), np.int32), shapes])
-    return Plan(
-        np.concatenate([first.moves, then.moves]),
-        np.concatenate([first.batch_offsets, then.batch_offsets[1:] + first.batch_offsets[-1]]),
-        np.concatenate([first.linked, then.linked]),
-        shapes,
-        then.path_positions,
-        then.path_off,
-    )
+    moves = np.concatenate([first.moves, then.moves])
+    offsets = np.concatenate([first.batch_offsets, then.batch_offsets[1:] + first.batch_offsets[-1]])
+    linked = np.concatenate([first.linked, then.linked])
+    return as_plan((moves, offsets, linked, shapes, then.path_positions, then.path_off))
 
 
 def construct_other(registry: Registry, choice: Mapping[str, Any], context: Context) -> Planner:
@@ -162,6 +163,7 @@ class RepairPlanner:
         dop = getattr(planner, "degree_of_parallelism", motion.max_tweezers)
         limits = min(dop, motion.max_column_tones), min(dop, motion.max_row_tones)
         self.degree_of_parallelism = dop
+        self._grid = context.grid
         self._planner = planner
         self._repair = Repair(settings.below, limits, dop, context)
 
@@ -185,5 +187,8 @@ class RepairPlanner:
             atoms = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), "repair") from error
+        fill = nearest_to_centre(target.fill, int(np.count_nonzero(atoms)), self._grid)
         plan = self._planner.plan(atoms, target)
-        return self._repair.improve(plan, atoms, target, lambda after: self._planner.plan(after, target))
+        return self._repair.improve(
+            plan, atoms, fill, target, lambda after: self._planner.plan(after, target)
+        )

@@ -22,7 +22,7 @@ from labseq.plugin import (
     TargetPattern,
     as_occupancy,
 )
-from labseq.plugin.geometry import from_the_centre
+from labseq.plugin.geometry import from_the_centre, nearest_to_centre
 from labseq.plugin.motion import site_time_s
 from labseq.plugin.plan_kernels import FinishedPlan, as_plan
 
@@ -38,13 +38,13 @@ class Sites:
         atoms: bool (n_rows, n_cols), as detected.
         fill: The same shape, the fill sites that the atoms suffice for.
         clear: The same shape, the sites that must be empty.
-        order: int64 (n_fill,), the sites in ``fill``, row * n_cols + col, the innermost first.
+        wanted: The same shape, the fill sites of the whole target.
     """
 
     atoms: Occupancy
     fill: Bools
     clear: Bools
-    order: Ints
+    wanted: Bools
 
 
 class RivalPlanner(ABC):
@@ -103,10 +103,8 @@ class RivalPlanner(ABC):
             atoms = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), self.name) from error
-        order = from_the_centre(target.fill, self._grid)[: np.count_nonzero(atoms)]
-        fill = np.zeros_like(target.fill)
-        fill.reshape(-1)[order] = True
-        return Sites(atoms, fill, target.clear, order)
+        fill = nearest_to_centre(target.fill, int(np.count_nonzero(atoms)), self._grid)
+        return Sites(atoms, fill, target.clear, target.fill)
 
 
 class LineSettings(Settings):
@@ -242,7 +240,8 @@ class LsapPlanner(RivalPlanner):
 
         from labseq_rivals.kernels_lsap import plan_assignment
 
-        sources, order = np.flatnonzero(sites.atoms), sites.order
+        sources = np.flatnonzero(sites.atoms)
+        order = from_the_centre(sites.wanted, self._grid)[: len(sources)]
         stays = ~sites.clear.reshape(-1)[sources]  # of equal sums, the one that leaves fewest atoms to clear
         cost = travel(order, sources, sites.fill.shape[1]) ** self.power * (len(order) + 1) + stays
         _, assigned = linear_sum_assignment(cost)
