@@ -19,10 +19,11 @@ from labseq.plugin import (
     format_quantity,
 )
 from labseq.plugin.messages import clean, unknown_name
-from labseq.plugin.serial import SerialMessage, serial_emergency
+from labseq.plugin.serial import SerialMessage
 from labseq_serial.line import Line, open_line
 from labseq_serial.patterns import compiled
-from labseq_serial.settings import Call, SerialSettings, call_of
+from labseq_serial.settings import SerialSettings
+from labseq_serial.simulated import SimulatedLine
 from labseq_serial.values import Scalar
 
 T = TypeVar("T")
@@ -40,7 +41,9 @@ class RefusedError(DeviceError):
 class Instrument:
     """The commands and values of an instrument on an open line."""
 
-    def __init__(self, line: Line, settings: SerialSettings, device: str, clock: Clock) -> None:
+    def __init__(
+        self, line: Line | SimulatedLine, settings: SerialSettings, device: str, clock: Clock
+    ) -> None:
         self.line = line
         self._settings = settings
         self._device = device
@@ -53,7 +56,7 @@ class Instrument:
             return {}
 
         def ask() -> dict[str, str]:
-            reply = self.line.exchange(identify.ask, self._settings.timeout)
+            reply = self.line.identify()
             match = compiled(identify.reply).fullmatch(reply)
             if match is None:
                 what = f"the instrument reports that it is '{clean(reply)}'"
@@ -70,7 +73,7 @@ class Instrument:
         value = self._settings.values[name]
 
         def ask() -> Scalar:
-            reply = self.line.exchange(value.ask, value.timeout or self._settings.timeout)
+            reply = self.line.ask(name)
             self._refuse(value.error, value.ask, reply)
             try:
                 return value.value_in(reply)
@@ -80,14 +83,14 @@ class Instrument:
 
         return self._retried(ask)
 
-    def carry_out(self, name: str, values: Mapping[str, Scalar]) -> None:
+    def carry_out(self, name: str, arguments: Mapping[str, Scalar]) -> None:
         """Send a command, wait for its reply, and until the values are as the command makes them."""
         command = self._settings.commands[name]
         timeout_s = command.timeout or self._settings.timeout
-        text = command.text(values)
+        text = command.text(arguments)
 
         def send() -> None:
-            reply = self.line.exchange(text, timeout_s, answered=command.reply is not None)
+            reply = self.line.send(name, arguments)
             self._refuse(command.error, text, reply)
             if command.reply is not None and compiled(command.reply).fullmatch(reply) is None:
                 what = f"{name}: '{clean(text)}' was answered by '{clean(reply)}'"
@@ -104,31 +107,27 @@ class Instrument:
                 raise DeviceTimeoutError(self._device, text, timeout_s)
             self._clock.sleep(LOOK_S)
 
-    def carry_out_all(self, calls: Iterable[Call]) -> list[LabseqError]:
-        """Carry out calls of the description, also after one that fails.
+    def carry_out_all(self, names: Iterable[str]) -> list[LabseqError]:
+        """Carry out commands without arguments, also after one that fails.
 
         Returns:
             The failures.
         """
         failures: list[LabseqError] = []
-        for call in calls:
+        for name in names:
             try:
-                self.call(call)
+                self.carry_out(name, {})
             except LabseqError as failure:
                 failures.append(failure)
         return failures
 
-    def call(self, call: Call) -> None:
-        """Carry out a call of the description; its arguments were checked with the profile."""
-        self.carry_out(*self._named(call))
-
-    def message(self, call: Call) -> SerialMessage:
-        """What a call sends, and what must come of it, for another process."""
-        settings, (name, values) = self._settings, self._named(call)
+    def message(self, name: str) -> SerialMessage:
+        """What a command without arguments sends, and what must come of it, for another process."""
+        settings = self._settings
         command = settings.commands[name]
         answered = command.reply is not None
         return SerialMessage(
-            command.text(values) + settings.write_ends_with,
+            command.text({}) + settings.write_ends_with,
             settings.read_ends_with if answered else "",
             command.timeout or settings.timeout if answered else settings.pause,
             command.reply or "",
@@ -149,11 +148,6 @@ class Instrument:
             value=value.words[state] if isinstance(state, bool) else state,
             choices=tuple(value.words) if isinstance(state, bool) else (),
         )
-
-    def _named(self, call: Call) -> tuple[str, dict[str, Scalar]]:
-        name, given = call_of(call)
-        arguments = self._settings.commands[name].arguments
-        return name, {key: arguments[key].value_of(value) for key, value in given.items()}
 
     def _differing(self, makes: Mapping[str, Scalar]) -> str | None:
         """Describe the first value that is not as a command makes it; None if all are."""
@@ -239,7 +233,7 @@ class SerialDevice(Device):
             return None
         ready = [SerialMessage("", within_s=settings.wait_after_open)] if settings.wait_after_open else []
         messages = [*ready, *map(instrument.message, settings.safe_state)]
-        return serial_emergency(instrument.line.port, messages, settings.encoding, echo=settings.echo)
+        return instrument.line.emergency(messages)
 
     def command(self, name: str, **arguments: Any) -> None:
         """Carry out a declared command.
@@ -338,8 +332,7 @@ class SerialDevice(Device):
     def _connected(self, *, on_open: bool = True) -> Instrument:
         """The right instrument on an open line."""
         settings = self._settings
-        port = open_line(settings, self._name, self._clock)
-        line = Line(port, settings, self._name, self._clock)
+        line = open_line(settings, self._name, self._clock)
         instrument = Instrument(line, settings, self._name, self._clock)
         try:
             self._identity = instrument.identify()
@@ -356,8 +349,8 @@ class SerialDevice(Device):
     def _begin(self, instrument: Instrument) -> None:
         """Send ``on_open``; after a failure also ``safe_state``."""
         try:
-            for call in self._settings.on_open:
-                instrument.call(call)
+            for name in self._settings.on_open:
+                instrument.carry_out(name, {})
         except LabseqError:
             instrument.carry_out_all(self._settings.safe_state)
             raise

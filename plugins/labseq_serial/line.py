@@ -1,17 +1,34 @@
-"""The line: opening the port, what is sent and received, and everything that can go wrong with it."""
+"""The line to an instrument: what is sent and received, and everything that can go wrong with it."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Generator
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, Final
 
-from labseq.plugin import Clock, DeviceError, DeviceTimeoutError, TransientError, format_quantity, wait_for
+from labseq.plugin import (
+    Clock,
+    DeviceError,
+    DeviceTimeoutError,
+    Emergency,
+    TransientError,
+    format_quantity,
+    wait_for,
+)
 from labseq.plugin.messages import clean
-from labseq.plugin.serial import BROKEN, Port, is_write_timeout, open_port, ports_text
+from labseq.plugin.serial import (
+    BROKEN,
+    Port,
+    SerialMessage,
+    is_write_timeout,
+    open_port,
+    ports_text,
+    serial_emergency,
+)
 from labseq_serial.settings import SIMULATED, SerialSettings, UsbSettings
-from labseq_serial.simulated import SimulatedPort
+from labseq_serial.simulated import SimulatedLine
+from labseq_serial.values import Scalar
 
 MAX_REPLY: Final = 4096
 """Longest reply in bytes; more is noise."""
@@ -20,8 +37,9 @@ MAX_REPLY: Final = 4096
 class Line:
     """An open port, and one exchange on it after the other.
 
+    Replies are without their end and surrounding spaces.
+
     Attributes:
-        port: The open port.
         broken: Whether the port was lost; it must be opened again.
         aborted: Set by another thread to end a wait for a reply.
     """
@@ -29,17 +47,39 @@ class Line:
     def __init__(self, port: Port, settings: SerialSettings, device: str, clock: Clock) -> None:
         self.broken = False
         self.aborted = threading.Event()
-        self.port = port
+        self._port = port
         self._settings = settings
         self._device = device
         self._clock = clock
         self._free_s = clock.now() + settings.wait_after_open
 
-    def exchange(self, text: str, timeout_s: float, *, answered: bool = True) -> str:
-        """Send a text and wait for the reply; what came before is dropped.
+    def identify(self) -> str:
+        """Ask the instrument what it is."""
+        identify = self._settings.identify
+        return "" if identify is None else self._exchange(identify.ask, self._settings.timeout)
 
-        Returns:
-            The reply without its end and surrounding spaces; "" if none is expected.
+    def ask(self, name: str) -> str:
+        """Ask for a value."""
+        value = self._settings.values[name]
+        return self._exchange(value.ask, value.timeout or self._settings.timeout)
+
+    def send(self, name: str, arguments: Mapping[str, Scalar]) -> str:
+        """Send a command with arguments in SI; the reply is "" if none comes."""
+        command = self._settings.commands[name]
+        timeout_s = command.timeout or self._settings.timeout
+        return self._exchange(command.text(arguments), timeout_s, answered=command.reply is not None)
+
+    def emergency(self, messages: Sequence[SerialMessage]) -> Emergency | None:
+        """How another process sends messages."""
+        return serial_emergency(self._port, messages, self._settings.encoding, echo=self._settings.echo)
+
+    def close(self) -> None:
+        """Close the port; legal in any state."""
+        with suppress(*BROKEN):
+            self._port.close()
+
+    def _exchange(self, text: str, timeout_s: float, *, answered: bool = True) -> str:
+        """Send a text and wait for the reply; what came before is dropped.
 
         Raises:
             DeviceTimeoutError: No reply, or one without an end.
@@ -54,8 +94,8 @@ class Line:
         end = settings.read_ends_with.encode(settings.encoding) if answered else b""
         try:
             with self._unbroken(text, timeout_s):
-                self.port.reset_input_buffer()
-                self.port.write(sent)
+                self._port.reset_input_buffer()
+                self._port.write(sent)
             came = self._receive(text, sent if settings.echo else b"", end, timeout_s)
         finally:
             self._free_s = self._clock.now() + settings.pause
@@ -65,11 +105,6 @@ class Line:
             what = f"the reply to '{clean(text)}', '{_visible(came)}', is not {settings.encoding}"
             raise DeviceError(self._device, f"{what}; check 'baud_rate', 'parity' and 'encoding'") from None
 
-    def close(self) -> None:
-        """Close the port; legal in any state."""
-        with suppress(*BROKEN):
-            self.port.close()
-
     def _receive(self, text: str, echo: bytes, end: bytes, timeout_s: float) -> bytes:
         """Read the bytes between the echo and the end; nothing is read if both are empty."""
         came = bytearray()
@@ -77,7 +112,7 @@ class Line:
         def look(_: float) -> int | None:
             if self.aborted.is_set():
                 raise DeviceError(self._device, f"'{clean(text)}' was aborted by the safe state")
-            came.extend(self.port.read(min(max(1, self.port.in_waiting), MAX_REPLY)))
+            came.extend(self._port.read(min(max(1, self._port.in_waiting), MAX_REPLY)))
             at = came.find(end, len(echo))
             return at if at >= 0 or len(came) > len(echo) + MAX_REPLY else None
 
@@ -112,6 +147,7 @@ class Line:
         except BROKEN as error:
             if isinstance(error, DeviceTimeoutError):  # an OSError too
                 raise
+            # a complete write times out too if the instrument stops the flow at that moment
             if is_write_timeout(error):
                 waited = format_quantity(timeout_s, "time")
                 what = f"'{clean(text)}' could not be sent within {waited}; see 'flow_control'"
@@ -125,10 +161,10 @@ def _visible(came: bytes) -> str:
     return clean(came.decode("ascii", "backslashreplace"))
 
 
-def open_line(settings: SerialSettings, device: str, clock: Clock) -> Port:
-    """Open the port of a profile exclusively, or a simulated instrument."""
+def open_line(settings: SerialSettings, device: str, clock: Clock) -> Line | SimulatedLine:
+    """Open the port of a profile exclusively, or the line to a simulated instrument."""
     if settings.port == SIMULATED:
-        return SimulatedPort(settings, clock)
+        return SimulatedLine(settings, clock)
     port = settings.port if settings.usb is None else _find(settings.usb, device)
     assert port is not None
     options: dict[str, Any] = {
@@ -140,7 +176,7 @@ def open_line(settings: SerialSettings, device: str, clock: Clock) -> Port:
         "xonxoff": settings.flow_control == "xon_xoff",
         "write_timeout": settings.timeout,
     }
-    return open_port(port, device, settings.baud_rate, **options)
+    return Line(open_port(port, device, settings.baud_rate, **options), settings, device, clock)
 
 
 def _find(usb: UsbSettings, device: str) -> str:

@@ -4,209 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any, Final, Literal, Self, TypeAlias
+from typing import Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
 from labseq.plugin import Duration, PositiveDuration, Settings, Text, setting_error
 from labseq.plugin.messages import clean, closest, one_of
 from labseq.plugin.serial import is_network_port, port_identities, ports_here
-from labseq_serial.patterns import Sent, Template, compiled, example_of
+from labseq_serial.patterns import Piece, compiled, example_of, pieces
 from labseq_serial.values import ArgumentSettings, Scalar, ValueSettings, placed
 
 RESERVED: Final = frozenset({"self", "name", "owner", "timeout_s", "function"})
 """Names that arguments cannot have, because labseq's own calls use them."""
 _SLACK: Final = 1e-9
-
-
-class CallSettings(Settings):
-    """A command and its arguments, as in a step."""
-
-    do: Text = Field(description="a command")
-    arguments: dict[str, Scalar] = Field(default={}, description="its arguments")
-
-
-Call: TypeAlias = Text | CallSettings
-"""A command that the driver sends on its own: its name, or name and arguments."""
-
-
-class IdentifySettings(Settings):
-    """How the instrument reports what it is."""
-
-    ask: Text = Field(description="text that is sent")
-    reply: Text = Field(
-        description="pattern of the reply; groups `model`, `serial_number` and `firmware` are shown by "
-        "`labseq devices`"
-    )
-    example: Text | None = Field(default=None, description="an example of a reply, for dry runs")
-
-    def simulated_reply(self) -> str | None:
-        """A reply that matches."""
-        return self.example if self.example is not None else example_of(self.reply)
-
-    @model_validator(mode="after")
-    def _check_reply(self) -> Self:
-        check_reply(self.reply, self.simulated_reply())
-        return self
-
-
-class CommandSettings(Settings):
-    """A command of the instrument."""
-
-    send: Text = Field(description="text that is sent; `{name}` or `{name:.3f}` is an argument, `{{` a brace")
-    arguments: dict[str, ArgumentSettings] = Field(default={}, description="its arguments, by name")
-    reply: str | None = Field(
-        default=None,
-        description='pattern that the reply must match, as that of a value; `""` for an empty line or a '
-        "mere prompt; none: no reply comes",
-    )
-    error: Text | None = Field(default=None, description="pattern of a reply that reports an error")
-    makes: dict[str, bool | int | str] = Field(
-        default={},
-        description="values that the command leads to: they are read before, and if they have these values "
-        "already nothing is sent, and after, until they have them",
-    )
-    repeatable: bool = Field(
-        default=False, description="whether it may be sent again when the reply is missing or unreadable"
-    )
-    timeout: PositiveDuration | None = Field(
-        default=None,
-        description="how long the reply, and what the command makes, may take; none: as for all",
-    )
-    example: str | None = Field(default=None, description="an example of a reply, for dry runs")
-
-    @property
-    def template(self) -> Template:
-        """The parsed template ``send``."""
-        return Template.parse(self.send)
-
-    @property
-    def kinds(self) -> dict[str, type[Sent]]:
-        """The type of each argument on the line."""
-        return {name: argument.kind for name, argument in self.arguments.items()}
-
-    def text(self, values: Mapping[str, Scalar]) -> str:
-        """The text for these arguments, in SI."""
-        return self.template.format(
-            {name: self.arguments[name].to_line(value) for name, value in values.items()}
-        )
-
-    def values_in(self, text: str) -> dict[str, Scalar] | None:
-        """The arguments, in SI, in a text that was sent; None if it is not this command."""
-        sent = self.template.read(text, self.kinds)
-        if sent is None:
-            return None
-        values = {name: self.arguments[name].from_line(one) for name, one in sent.items()}
-        known = {name: value for name, value in values.items() if value is not None}
-        return known if len(known) == len(values) else None
-
-    def simulated_reply(self) -> str | None:
-        """A reply that matches; None if no reply comes, or none can be generated."""
-        if self.reply is None or self.example is not None:
-            return self.example
-        return example_of(self.reply)
-
-    def extremes(self) -> list[dict[str, Scalar]]:
-        """Arguments at their limits: all at the lowest, all at the highest, and mixed."""
-        ends = {name: argument.extremes() for name, argument in self.arguments.items()}
-        if not ends:
-            return [{}]
-        orders = ((0, 0), (1, 1), (0, 1), (1, 0))
-        return [{name: pair[order[k % 2]] for k, (name, pair) in enumerate(ends.items())} for order in orders]
-
-    @model_validator(mode="after")
-    def _check_placeholders(self) -> Self:
-        for name in self.arguments:
-            if not name.isidentifier() or name in RESERVED:
-                expected = f"a word of letters, digits and '_', none of {', '.join(sorted(RESERVED))}"
-                raise setting_error(
-                    f"an argument is called '{clean(name)}'", expected, at=("arguments", name), key=True
-                )
-        try:
-            names = self.template.names
-        except ValueError as error:
-            raise placed(error, "send") from None
-        for name in names:
-            if name not in self.arguments:
-                meant = closest(name, self.arguments)
-                hint = f"did you mean '{meant}'?" if meant else f"declare '{name}' below 'arguments'"
-                names = one_of(list(self.arguments))
-                expected = names if self.arguments else "no placeholder: the command has no arguments"
-                raise setting_error(f"'{{{name}}}' is not an argument", expected, hint, at=("send",))
-        for name in self.arguments:
-            if name not in names:
-                what = f"the argument '{name}' has no place in '{clean(self.send)}'"
-                raise setting_error(
-                    what, f"a placeholder {{{name}}} in 'send'", at=("arguments", name), key=True
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _check_round_trip(self) -> Self:
-        for values in self.extremes():
-            sent = {name: self.arguments[name].to_line(value) for name, value in values.items()}
-            try:
-                rounded, text = self.template.rounded(sent), self.template.format(sent)
-            except ValueError as error:
-                raise placed(error, "send") from None
-            if self.template.read(text, self.kinds) != rounded:
-                what = f"the arguments cannot be separated in '{clean(text)}'"
-                raise setting_error(what, "something between the placeholders", at=("send",))
-            for name, value in rounded.items():
-                self._check_rounded(name, value, text)
-        return self
-
-    def _check_rounded(self, name: str, sent: Sent, text: str) -> None:
-        argument = self.arguments[name]
-        value = argument.from_line(sent)
-        if value is None or isinstance(value, str | bool):
-            return
-        low, high = argument.limits
-        slack = _SLACK * max(abs(low), abs(high))
-        if not low - slack <= value <= high + slack:
-            key = "min" if value < low else "max"
-            what = f"as '{clean(text)}' it would be {argument.quantity.shown(value)}, beyond the limit"
-            raise setting_error(
-                what, "a limit with no more digits than are sent", at=("arguments", name, key)
-            )
-
-    @model_validator(mode="after")
-    def _check_replies(self) -> Self:
-        if self.reply is None:
-            for key in ("error", "example"):
-                if getattr(self, key) is not None:
-                    what = f"'{key}' is about a reply, but no 'reply' is waited for"
-                    raise setting_error(what, "a 'reply'", at=(key,), key=True)
-            return self
-        check_reply(self.reply, self.simulated_reply())
-        check_pattern(self.error, "error")
-        return self
-
-
-def check_pattern(pattern: str | None, key: str) -> re.Pattern[str] | None:
-    """Refuse a text that is not a pattern."""
-    try:
-        return None if pattern is None else compiled(pattern)
-    except ValueError as error:
-        raise placed(error, key) from None
-
-
-def check_reply(pattern: str, example: str | None) -> None:
-    """Refuse a pattern of replies for which there is no example."""
-    compiled_pattern = check_pattern(pattern, "reply")
-    if example is None:
-        what = f"labseq cannot generate a reply like '{clean(pattern)}'"
-        raise setting_error(what, "an example of one", "add 'example'", at=("reply",))
-    if compiled_pattern is not None and compiled_pattern.fullmatch(example) is None:
-        what = f"the reply '{clean(example)}' does not match"
-        raise setting_error(what, f"one like '{clean(pattern)}'", at=("example",))
-
-
-def call_of(call: Call) -> tuple[str, Mapping[str, Scalar]]:
-    """Name and arguments of a call."""
-    return (call, {}) if isinstance(call, str) else (call.do, call.arguments)
-
-
 SIMULATED: Final = "simulated"
 """The port of a simulated instrument."""
 _SCHEMES: Final = ("socket", "rfc2217")
@@ -240,6 +50,146 @@ class UsbSettings(Settings):
     def _check_any(self) -> Self:
         if not self.given:
             raise setting_error("this fits every adapter", "vid, pid or serial")
+        return self
+
+
+class IdentifySettings(Settings):
+    """How the instrument reports what it is."""
+
+    ask: Text = Field(description="text that is sent")
+    reply: Text = Field(
+        description="pattern of the reply; groups `model`, `serial_number` and `firmware` are shown by "
+        "`labseq devices`"
+    )
+    example: Text | None = Field(default=None, description="an example of a reply, for dry runs")
+
+    @property
+    def simulated_reply(self) -> str | None:
+        """A reply that matches; None if the profile needs an example."""
+        return example_of(self.reply) if self.example is None else self.example
+
+    @model_validator(mode="after")
+    def _check_reply(self) -> Self:
+        check_reply(self.reply, self.example)
+        return self
+
+
+class CommandSettings(Settings):
+    """A command of the instrument."""
+
+    send: Text = Field(description="text that is sent; `{name}` or `{name:.3f}` is an argument, `{{` a brace")
+    arguments: dict[str, ArgumentSettings] = Field(default={}, description="its arguments, by name")
+    reply: str | None = Field(
+        default=None,
+        description='pattern that the reply must match, as that of a value; `""` for an empty line or a '
+        "mere prompt; none: no reply comes",
+    )
+    error: Text | None = Field(default=None, description="pattern of a reply that reports an error")
+    makes: dict[str, bool | int | str] = Field(
+        default={},
+        description="values that the command leads to: they are read before, and if they have these values "
+        "already nothing is sent, and after, until they have them",
+    )
+    repeatable: bool = Field(
+        default=False, description="whether it may be sent again when the reply is missing or unreadable"
+    )
+    timeout: PositiveDuration | None = Field(
+        default=None,
+        description="how long the reply, and what the command makes, may take; none: as for all",
+    )
+    example: str | None = Field(default=None, description="an example of a reply, for dry runs")
+
+    @property
+    def pieces(self) -> list[Piece]:
+        """``send``, split at its arguments."""
+        return pieces(self.send)
+
+    @property
+    def simulated_reply(self) -> str | None:
+        """A reply that matches; None if none comes, or the profile needs an example."""
+        if self.reply is None or self.example is not None:
+            return self.example
+        return example_of(self.reply)
+
+    def text(self, values: Mapping[str, Scalar]) -> str:
+        """The text for these arguments, in SI.
+
+        Example:
+            >>> level = {"unit": "mV", "min": "0 V", "max": "1 V"}
+            >>> command = CommandSettings(send="VOLT {level:.1f} mV", arguments={"level": level})
+            >>> command.text({"level": 0.25})
+            'VOLT 250.0 mV'
+        """
+        sent = {name: self.arguments[name].to_line(value) for name, value in values.items()}
+        return "".join(
+            piece.literal + (piece.written(sent[piece.name]) if piece.name else "") for piece in self.pieces
+        )
+
+    @model_validator(mode="after")
+    def _check_placeholders(self) -> Self:
+        for name in self.arguments:
+            if not name.isidentifier() or name in RESERVED:
+                expected = f"a word of letters, digits and '_', none of {', '.join(sorted(RESERVED))}"
+                raise setting_error(
+                    f"an argument is called '{clean(name)}'", expected, at=("arguments", name), key=True
+                )
+        try:
+            names = {piece.name: None for piece in self.pieces if piece.name}
+        except ValueError as error:
+            raise placed(error, "send") from None
+        for name in names:
+            if name not in self.arguments:
+                meant = closest(name, self.arguments)
+                hint = f"did you mean '{meant}'?" if meant else f"declare '{name}' below 'arguments'"
+                expected = one_of(list(self.arguments)) or "no placeholder: the command has no arguments"
+                raise setting_error(f"'{{{name}}}' is not an argument", expected, hint, at=("send",))
+        for name in self.arguments:
+            if name not in names:
+                what = f"the argument '{name}' has no place in '{clean(self.send)}'"
+                raise setting_error(
+                    what, f"a placeholder {{{name}}} in 'send'", at=("arguments", name), key=True
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_formats(self) -> Self:
+        for piece in filter(lambda piece: piece.name, self.pieces):
+            for key, value in self.arguments[piece.name].extremes():
+                try:
+                    text = piece.written(self.arguments[piece.name].to_line(value))
+                except ValueError as error:
+                    raise placed(error, "send") from None
+                if isinstance(value, float):
+                    self._check_rounded(piece.name, key, text)
+        return self
+
+    def _check_rounded(self, name: str, key: str, text: str) -> None:
+        """Rounding keeps the order of numbers, so that it is enough to look at the limits."""
+        argument = self.arguments[name]
+        low, high = argument.limits
+        slack = _SLACK * max(abs(low), abs(high))
+        try:
+            value = argument.quantity.from_line(float(text))
+        except ValueError:
+            raise setting_error(
+                f"'{text}' is not a plain number", "a format such as .3f", at=("send",)
+            ) from None
+        if not low - slack <= value <= high + slack:
+            what = f"{key} as '{clean(text)}' would be {argument.quantity.shown(value)}, beyond the limit"
+            raise setting_error(
+                what, "a limit with no more digits than are sent", at=("arguments", name, key)
+            )
+
+    @model_validator(mode="after")
+    def _check_replies(self) -> Self:
+        if self.reply is None:
+            for key in ("error", "example"):
+                if getattr(self, key) is not None:
+                    what = f"'{key}' is about a reply, but no 'reply' is waited for"
+                    raise setting_error(what, "a 'reply'", at=(key,), key=True)
+            return self
+        check_reply(self.reply, self.example)
+        check_pattern(self.error, "error")
         return self
 
 
@@ -284,25 +234,23 @@ class SerialSettings(Settings):
     identify: IdentifySettings | None = Field(
         default=None, description="how the instrument reports what it is; another one is refused"
     )
-    on_open: tuple[Call, ...] = Field(
-        default=(),
-        description="commands sent when it was opened: `[remote, {do: mode, arguments: {number: 1}}]`",
+    on_open: tuple[Text, ...] = Field(
+        default=(), description="commands without arguments that are sent when it was opened: `[remote]`"
     )
     commands: dict[Text, CommandSettings] = Field(default={}, description="its commands, by name")
     values: dict[Text, ValueSettings] = Field(default={}, description="values that can be read, by name")
-    safe_state: tuple[Call, ...] = Field(
-        default=(), description="commands that make it safe; none: it is left as it is"
+    safe_state: tuple[Text, ...] = Field(
+        default=(), description="commands without arguments that make it safe; none: it is left as it is"
     )
 
     def texts(self) -> Iterator[tuple[tuple[str, ...], str]]:
-        """All texts that may be sent, with their places: questions, and commands at their limits."""
+        """All texts that are sent, with their places; commands without their arguments."""
         if self.identify is not None:
             yield ("identify", "ask"), self.identify.ask
         for name, value in self.values.items():
             yield ("values", name, "ask"), value.ask
         for name, command in self.commands.items():
-            for values in command.extremes():
-                yield ("commands", name, "send"), command.text(values)
+            yield ("commands", name, "send"), command.send
 
     def why_unsendable(self, text: str) -> str:
         """Why a text cannot be sent, and what to do; "" if it can be sent."""
@@ -362,35 +310,19 @@ class SerialSettings(Settings):
     @model_validator(mode="after")
     def _check_calls(self) -> Self:
         for key in ("on_open", "safe_state"):
-            calls: tuple[Call, ...] = getattr(self, key)
-            for i, call in enumerate(calls):
-                self._check_call(call, (key, i))
+            names: tuple[str, ...] = getattr(self, key)
+            for i, name in enumerate(names):
+                command = self.commands.get(name)
+                if command is None:
+                    meant = closest(name, self.commands)
+                    hint = f"did you mean '{meant}'?" if meant else "declare it below 'commands'"
+                    what = f"there is no command '{clean(name)}'"
+                    raise setting_error(what, known(self.commands), hint, at=(key, i))
+                if command.arguments:
+                    what = f"'{name}' needs {', '.join(command.arguments)}"
+                    hint = "declare one with their values in its text"
+                    raise setting_error(what, "a command without arguments", hint, at=(key, i))
         return self
-
-    def _check_call(self, call: Call, at: tuple[str | int, ...]) -> None:
-        name, arguments = call_of(call)
-        command = self.commands.get(name)
-        place = at if isinstance(call, str) else (*at, "do")
-        if command is None:
-            meant = closest(name, self.commands)
-            hint = f"did you mean '{meant}'?" if meant else "declare it below 'commands'"
-            raise setting_error(f"there is no command '{clean(name)}'", known(self.commands), hint, at=place)
-        for argument, given in arguments.items():
-            inner = (*at, "arguments", argument)
-            declared = command.arguments.get(argument)
-            if declared is None:
-                what = f"'{name}' has no argument '{clean(argument)}'"
-                raise setting_error(what, known(command.arguments), at=inner, key=True)
-            try:
-                value = declared.value_of(given)
-            except ValueError as error:
-                raise placed(ValueError(f"{argument}: {error}"), *inner) from None
-            if not declared.allows(value):
-                raise setting_error(f"{argument} is {given}", declared.shown_limits(), at=inner)
-        missing = [argument for argument in command.arguments if argument not in arguments]
-        if missing:
-            what, first = f"'{name}' needs {', '.join(missing)}", missing[0]
-            raise setting_error(what, f"{{do: {name}, arguments: {{{first}: ...}}}}", at=place)
 
     @model_validator(mode="after")
     def _check_made_values(self) -> Self:
@@ -407,6 +339,26 @@ class SerialSettings(Settings):
                     raise setting_error(f"the value '{made}' is of type {value.type}", expected, at=at)
         return self
 
+    @model_validator(mode="after")
+    def _check_simulated_replies(self) -> Self:
+        if self.port != SIMULATED:
+            return self
+        for at, pattern, reply in self._simulated_replies():
+            if reply is None:
+                what = f"a simulated instrument cannot make a reply of the pattern '{clean(pattern)}'"
+                raise setting_error(what, "an example of one", "add 'example'", at=(*at, "reply"))
+        return self
+
+    def _simulated_replies(self) -> Iterator[tuple[tuple[str, ...], str, str | None]]:
+        """Place and pattern of each reply, and what a simulated instrument would reply."""
+        if self.identify is not None:
+            yield ("identify",), self.identify.reply, self.identify.simulated_reply
+        for name, command in self.commands.items():
+            if command.reply is not None:
+                yield ("commands", name), command.reply, command.simulated_reply
+        for name, value in self.values.items():
+            yield ("values", name), value.reply, value.reply_with(value.typical)
+
 
 def known(names: Mapping[str, object]) -> str:
     """The names that the profile declares, for a message."""
@@ -419,3 +371,19 @@ def _can_be(text: str, encoding: str) -> bool:
     except UnicodeEncodeError:
         return False
     return True
+
+
+def check_pattern(pattern: str | None, key: str) -> re.Pattern[str] | None:
+    """Refuse a text that is not a pattern."""
+    try:
+        return None if pattern is None else compiled(pattern)
+    except ValueError as error:
+        raise placed(error, key) from None
+
+
+def check_reply(pattern: str, example: str | None) -> None:
+    """Refuse what is not a pattern, and an example that does not match it."""
+    found = check_pattern(pattern, "reply")
+    if found is not None and example is not None and found.fullmatch(example) is None:
+        what = f"the reply '{clean(example)}' does not match"
+        raise setting_error(what, f"one like '{clean(pattern)}'", at=("example",))

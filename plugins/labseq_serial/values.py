@@ -188,11 +188,6 @@ class ArgumentSettings(TypedSettings):
 
     choices: tuple[Text, ...] = Field(default=(), description="what it may be, of a text; none: any text")
 
-    @property
-    def kind(self) -> type[Sent]:
-        """Its type on the line."""
-        return {"float": float, "int": int}.get(self.type, str)
-
     def value_of(self, given: object) -> Scalar:
         """The value of an argument as a step gives it, in SI.
 
@@ -215,22 +210,18 @@ class ArgumentSettings(TypedSettings):
             return self.words[value]
         return self.quantity.to_line(value) if self.type == "float" and not isinstance(value, str) else value
 
-    def from_line(self, sent: Sent) -> Scalar | None:
-        """The value of an argument on the line; None if it is not a value of this argument."""
+    def extremes(self) -> list[tuple[str, Scalar]]:
+        """The limits of a number, with their keys; one value of anything else."""
         if self.type == "bool":
-            return self.words.index(str(sent)) == 1 if sent in self.words else None
+            return [("words", False)]
         if self.type == "text":
-            return sent if not self.choices or sent in self.choices else None
-        return self.quantity.from_line(float(sent)) if self.type == "float" else sent
-
-    def extremes(self) -> tuple[Scalar, Scalar]:
-        """Its limits, or its first and last choice."""
-        if self.type == "bool":
-            return False, True
-        if self.type == "text":
-            return (self.choices[0], self.choices[-1]) if self.choices else ("A", "B9")
+            return [("choices", self.choices[0] if self.choices else "A")]
         low, high = self.limits
-        return (low, high) if self.type == "float" else (math.ceil(low), math.floor(high))
+        return (
+            [("min", low), ("max", high)]
+            if self.type == "float"
+            else [("min", math.ceil(low)), ("max", math.floor(high))]
+        )
 
     def _may_be_sent(self, text: str) -> bool:
         if self.choices:
@@ -308,11 +299,6 @@ def placed(error: ValueError, *at: str | int, key: bool = False) -> PydanticCust
     return setting_error(what, expected, hint, at=at, key=key)
 
 
-_PLAIN: Final = (".12g", ".9f", ".6f", ".3f", ".2f", ".1f", ".0f", ".6e", ".6E")
-_SPECS: Final = (*_PLAIN, *(f"+{spec}" for spec in _PLAIN))
-"""Formats in which a simulated instrument may give a number, the more exact ones first."""
-
-
 class InterlockSettings(Settings):
     """Condition on a value, without which no atoms are picked up."""
 
@@ -367,7 +353,8 @@ class ValueSettings(TypedSettings):
     )
     example: Text | None = Field(
         default=None,
-        description="an example of a reply, for dry runs; only needed if labseq cannot generate one",
+        description="an example of a reply, for dry runs; needed if the pattern, with a value in place of "
+        "the group, does not match itself",
     )
 
     def value_in(self, reply: str) -> Scalar:
@@ -386,14 +373,26 @@ class ValueSettings(TypedSettings):
         return value
 
     def reply_with(self, value: Scalar) -> str | None:
-        """A reply with this value, as a simulated instrument gives it; None if none can be written."""
-        if self.example is not None:
-            return self.example
-        return next(filter(None, (example_of(self.reply, text) for text in self._written(value))), None)
+        """A reply with this value, as a simulated instrument gives it; None if the profile needs an example.
+
+        The value replaces that of the example; if the result does not match the pattern, the reply is the
+        example as it is.
+        """
+        if self.example is None:
+            return example_of(self.reply, self._written(value))
+        pattern = compiled(self.reply)
+        match = pattern.fullmatch(self.example)
+        assert match is not None, "checked with the profile"
+        decimals = len(match[VALUE].partition(".")[2])
+        text = self._written(value, f".{decimals}f" if decimals else "")
+        reply = self.example[: match.start(VALUE)] + text + self.example[match.end(VALUE) :]
+        return reply if pattern.fullmatch(reply) else self.example
 
     @property
     def typical(self) -> Scalar:
-        """A value that is plausible and that the interlock allows."""
+        """That of the example; without one a value that is plausible and that the interlock allows."""
+        if self.example is not None:
+            return self.value_in(self.example)
         if self.interlock is not None and self.interlock.one_of:
             return self.interlock.one_of[0]
         if not self.is_number:
@@ -422,15 +421,12 @@ class ValueSettings(TypedSettings):
             raise ValueError(f"its value is '{clean(text)}'; expected {kind}")
         return self.quantity.from_line(number) if isinstance(number, float) else number
 
-    def _written(self, value: Scalar) -> list[str]:
+    def _written(self, value: Scalar, spec: str = "") -> str:
         if isinstance(value, bool):
-            return [self.words[value]]
-        if isinstance(value, str):
-            return [value]
-        if self.type == "int":
-            return [f"{value:d}", f"{value:+d}"]
-        on_line = self.quantity.to_line(value)
-        return [format(on_line, spec) for spec in _SPECS]
+            return self.words[value]
+        if isinstance(value, float):
+            return format(self.quantity.to_line(value), spec or ".12g")
+        return str(value)
 
     @model_validator(mode="after")
     def _patterns_are_patterns(self) -> Self:
@@ -472,18 +468,10 @@ class ValueSettings(TypedSettings):
     @model_validator(mode="after")
     def _example_fits(self) -> Self:
         if self.example is None:
-            reply = self.reply_with(self.typical)
-            if reply is None:
-                what = f"labseq cannot generate a reply like '{clean(self.reply)}' with the value "
-                raise setting_error(
-                    what + self.shown(self.typical), "an example of one", "add 'example'", at=("reply",)
-                )
-        else:
-            reply = self.example
+            return self
         try:
-            self.value_in(reply)
+            self.value_in(self.example)
         except ValueError as error:
-            raise placed(
-                ValueError(f"the reply '{clean(reply)}' does not match: {error}"), "example"
-            ) from None
+            text = f"the reply '{clean(self.example)}' does not match: {error}"
+            raise placed(ValueError(text), "example") from None
         return self

@@ -34,6 +34,7 @@ PROFILE = r"""
     set:
       send: "FREQ {frequency:.6f}"
       arguments: {frequency: {unit: MHz, min: 1 MHz, max: 200 MHz}}
+    dark: {send: FREQ 1.000000}
     nonsense: {send: NONSENSE, reply: OK, error: "ERR.*", repeatable: true}
   values:
     is_open: {ask: "STATE?", type: bool, poll: true}
@@ -45,7 +46,7 @@ PROFILE = r"""
       min: -50 degC
       max: 100 degC
       interlock: {min: 15 degC, max: 25 degC, message: look at the chiller}
-  safe_state: [{do: set, arguments: {frequency: 1 MHz}}, close]
+  safe_state: [dark, close]
 """
 """The description of the simulator."""
 
