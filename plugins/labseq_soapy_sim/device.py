@@ -1,7 +1,7 @@
-"""A software-defined radio that keeps the samples it is sent: what a module of SoapySDR does for its radio.
+"""A software-defined radio that keeps the samples it is sent, with the methods of a ``SoapyDevice``.
 
-It has transmit channels only, plays from a buffer of finite length by a clock, and reports an underflow when
-that ran dry, and packets that were lost or late as the module for UHD does.
+It plays from a buffer of finite length by a clock, and reports an underflow when that ran dry, and packets
+that were lost or late as SoapySDR's module for UHD does.
 """
 
 from __future__ import annotations
@@ -14,6 +14,16 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 from filelock import Timeout
+from labseq_soapy_stream.output import Samples
+from labseq_soapy_stream.soapysdr import (
+    CORRUPTION,
+    NOT_SUPPORTED,
+    STREAM_ERROR,
+    TIME_ERROR,
+    TIMEOUT,
+    UNDERFLOW,
+    SoapyError,
+)
 from numpy.typing import NDArray
 
 from labseq_soapy_sim.ring import CHANNELS, HEADER, SAMPLES, Fault, create, radio_lock
@@ -28,13 +38,12 @@ COMPONENTS_HZ: Final[Mapping[str, tuple[float, float]]] = {"RF": (1e6, 6e9), "BB
 """Range of the local oscillators, and of the shift of the samples away from them."""
 ANTENNAS: Final = ("TX/RX",)
 CLOCK_SOURCES: Final = ("internal", "external")
-TIMEOUT: Final = -1
-STREAM_ERROR: Final = -2
-CORRUPTION: Final = -3
-NOT_SUPPORTED: Final = -5
-TIME_ERROR: Final = -6
-UNDERFLOW: Final = -7
-HAS_TIME: Final = 1 << 2
+DRIVER: Final = "capture"
+CODES: Final[Mapping[int, str]] = {
+    STREAM_ERROR: "STREAM_ERROR",
+    NOT_SUPPORTED: "NOT_SUPPORTED",
+}
+"""Codes that end a stream, and their names."""
 PAUSE_S: Final = 1e-3
 """Between two looks at a state that another process may change."""
 
@@ -63,35 +72,39 @@ class ComputerClock:
         time.sleep(duration_s)
 
 
-class Radio:
+class SimulatedDevice:
     """One radio that is open.
 
     Args:
-        arguments: Those of ``device: simulated,...`` and ``folder``; the package's README describes them.
-        clock: Clock by which it plays.
+        arguments: ``driver=capture``, with those of ``device: simulated,...``; the package's README
+            describes them.
+        clock: Clock by which it plays; by default the computer's.
 
     Raises:
-        RuntimeError: It is lost, or another process has it open. Methods raise this for what they refuse.
+        SoapyError: It is lost, or another process has it open. Methods raise this for what they refuse.
     """
 
-    def __init__(self, arguments: Mapping[str, str], clock: Clock) -> None:
-        self._clock = clock
-        self._folder = Path(arguments.get("folder", "."))
-        self._unlocked = arguments.get("unlocked", "")
-        self._fault = arguments.get("fault", "")
-        self._number = {key: float(arguments.get(key, default)) for key, default in NUMBERS.items()}
+    def __init__(self, arguments: str, clock: Clock | None = None) -> None:
+        given = read_markup(arguments)
+        self._clock = clock or ComputerClock()
+        self._folder = Path(given.get("folder", "."))
+        self._unlocked = given.get("unlocked", "")
+        self._fault = given.get("fault", "")
+        self._number = {key: float(given.get(key, default)) for key, default in NUMBERS.items()}
         self._shift_hz = [0.0] * CHANNELS
         self._resources = ExitStack()
+        if given.get("driver") != DRIVER:
+            raise SoapyError("no match")
         if self._fault == "absent" or _is_gone(self._folder):
-            raise RuntimeError("no such radio")
+            raise SoapyError("no such radio")
         try:
             self._resources.enter_context(radio_lock(self._folder).acquire(timeout=0.1))
         except Timeout:
-            raise RuntimeError("the device is busy: another program has opened it") from None
+            raise SoapyError("the device is busy: another program has opened it") from None
         self._header, self._ring = create(self._folder)
         for name in ("speed", "patience", "leakage"):
             self._header["patience_s" if name == "patience" else name] = self._number[name]
-        self._zero_s = clock.now()
+        self._zero_s = self._clock.now()
         self._channels: Sequence[int] = ()
         self._records: list[Any] = []
         self._is_dry = False  # an underflow was counted, and no samples came since
@@ -105,75 +118,77 @@ class Radio:
 
     def close(self) -> None:
         """Switch the transmitters off; another process may open the radio then."""
+        if self._channels:
+            raise SoapyError("the radio was closed before its stream: this would end a real program")
         self._header["is_active"] = 0
         self._trace("close")
         self._resources.close()
 
-    def check(self) -> None:
-        """Refuse every call once the radio was unplugged."""
-        if self._has(Fault.GONE):
-            raise RuntimeError("the radio does not answer: was it unplugged?")
+    def identify(self) -> dict[str, str]:
+        """Driver, hardware, serial number."""
+        return {"driver": DRIVER, "hardware": DRIVER, "serial": "simulated"}
 
     @property
     def n_channels(self) -> int:
         """Number of channels that transmit."""
         return int(self._number["channels"])
 
-    def check_channel(self, channel: int) -> None:
-        """Refuse a channel that it does not have."""
-        if not channel < self.n_channels:
-            raise RuntimeError(f"there is no channel {channel}")
-
     def set_clock_source(self, source: str) -> None:
         """Choose the reference of its clocks."""
         if source not in CLOCK_SOURCES:
-            raise RuntimeError(f"there is no clock source {source}")
+            raise SoapyError(f"there is no clock source {source}")
 
-    def set_antenna(self, _channel: int, name: str) -> None:
-        """Choose a connector."""
-        if name not in ANTENNAS:
-            raise RuntimeError(f"there is no antenna {name}")
+    def set(self, what: str, channel: int, value: float | str) -> None:
+        """Set "Antenna", "SampleRate" or "Gain" of a channel, as near as the radio can; it has no filters."""
+        self._check_channel(channel)
+        if what == "Antenna" and value not in ANTENNAS:
+            raise SoapyError(f"there is no antenna {value}")
+        if what == "SampleRate":  # of all channels
+            self._header["rate_hz"] = value
+        if what == "Gain":
+            lowest, highest, step = GAINS_DB
+            gain_db = min(max(round(float(value) / step) * step, lowest), highest)
+            self._header["gain_db"][channel] = gain_db
+            self._trace("gain", channel, gain_db)
 
-    @property
-    def rate_hz(self) -> float:
-        """Sample rate of all channels."""
-        return float(self._header["rate_hz"])
+    def get(self, what: str, channel: int) -> float:
+        """Read "SampleRate", "Frequency" or "Gain" of a channel back."""
+        self._check_channel(channel)
+        if what == "SampleRate":
+            return float(self._header["rate_hz"])
+        return float(self._header[{"Frequency": "frequency_hz", "Gain": "gain_db"}[what]][channel])
 
-    @rate_hz.setter
-    def rate_hz(self, value: float) -> None:
-        if not value > 0.0:
-            raise RuntimeError("the sample rate is not above 0")
-        self._header["rate_hz"] = value
+    def gain_range(self, channel: int) -> tuple[float, float]:
+        """Lowest and highest gain in dB."""
+        self._check_channel(channel)
+        return GAINS_DB[:2]
 
-    @property
-    def components(self) -> tuple[str, ...]:
-        """Parts of the frequency, in the order in which SoapySDR sets them."""
-        return ("RF", "BB") if self._number["components"] > 1 else ("RF",)
+    def set_frequency(self, channel: int, frequency_hz: float, offset_hz: float) -> None:
+        """Tune RF to a frequency plus an offset, and BB to what is left, each as near as the radio can."""
+        self._check_channel(channel)
+        (low_hz, high_hz), (least_hz, most_hz) = COMPONENTS_HZ["RF"], COMPONENTS_HZ["BB"]
+        tuned_hz = min(max(frequency_hz + offset_hz + self._number["detune"], low_hz), high_hz)
+        self._header["oscillator_hz"][channel] = tuned_hz
+        if "BB" in self.components(channel):
+            self._shift_hz[channel] = min(max(frequency_hz - tuned_hz, least_hz), most_hz)
+        self._header["frequency_hz"][channel] = tuned_hz + self._shift_hz[channel]
 
-    def tune(self, channel: int, component: str, frequency_hz: float) -> None:
-        """Set a part of the frequency, as near as the radio can."""
-        lowest, highest = COMPONENTS_HZ[component]
-        if component == "RF":
-            frequency_hz += self._number["detune"]
-            self._header["oscillator_hz"][channel] = min(max(frequency_hz, lowest), highest)
-        else:
-            self._shift_hz[channel] = min(max(frequency_hz, lowest), highest)
-        self._header["frequency_hz"][channel] = (
-            self._header["oscillator_hz"][channel] + self._shift_hz[channel]
-        )
+    def components(self, channel: int) -> set[str]:
+        """Components of the frequency."""
+        self._check_channel(channel)
+        return {"RF", "BB"} if self._number["components"] > 1 else {"RF"}
 
-    def tuned_hz(self, channel: int, component: str) -> float:
-        """A part of the frequency."""
-        return float(self._header["oscillator_hz"][channel] if component == "RF" else self._shift_hz[channel])
+    def component_hz(self, channel: int, name: str) -> float:
+        """A component of the frequency."""
+        return float(self._header["oscillator_hz"][channel] if name == "RF" else self._shift_hz[channel])
 
-    def sensors(self, channel: int | None) -> tuple[str, ...]:
+    def sensors(self, channel: int | None) -> set[str]:
         """Sensors of a channel, or of the whole radio."""
-        return ("ref_locked",) if channel is None else ("lo_locked",)
+        return {"ref_locked"} if channel is None else {"lo_locked"}
 
     def read_sensor(self, channel: int | None, name: str) -> str:
         """Value of a sensor."""
-        if name not in self.sensors(channel):
-            raise RuntimeError(f"there is no sensor {name}")
+        del channel
         return "false" if f"{self._unlocked}_locked" == name else "true"
 
     @property
@@ -186,20 +201,11 @@ class Radio:
         """Its clock, which goes at the speed of the computer's."""
         return int(1e9 * (self._clock.now() - self._zero_s))
 
-    def set_gain(self, channel: int, gain_db: float) -> None:
-        """Set the gain, as near as the radio can."""
-        lowest, highest, step = GAINS_DB
-        self._header["gain_db"][channel] = min(max(round(gain_db / step) * step, lowest), highest)
-        self._trace("gain", channel, self.gain_db(channel))
-
-    def gain_db(self, channel: int) -> float:
-        """Gain of a channel."""
-        return float(self._header["gain_db"][channel])
-
-    def set_up_stream(self, channels: Sequence[int]) -> None:
+    def set_up_stream(self, channels: Sequence[int], arguments: str) -> None:
         """Prepare for samples to these channels."""
+        del arguments
         for channel in channels:
-            self.check_channel(channel)
+            self._check_channel(channel)
         self._channels = channels
         if coerced_hz := self._number["coerce_rate"]:  # as its clock is set for this number of channels
             self._header["rate_hz"] = coerced_hz
@@ -208,6 +214,10 @@ class Radio:
                 self._resources.enter_context((self._folder / f"channel{channel}").open("wb", buffering=0))
                 for channel in channels
             ]
+
+    def close_stream(self) -> None:
+        """Take no more samples."""
+        self._channels = ()
 
     def activate(self) -> int:
         """Switch the transmitters on; returns a code of SoapySDR."""
@@ -220,28 +230,31 @@ class Radio:
 
     def deactivate(self) -> int:
         """Switch the transmitters off; returns a code of SoapySDR."""
+        if self._has(Fault.GONE):
+            raise SoapyError("the radio does not answer: was it unplugged?")
         self._header["is_active"] = 0
         self._trace("stop")
         return 0
 
-    def write(self, rows: Sequence[NDArray[np.uint64]], start_ns: int | None, timeout_s: float) -> int:
+    def write(self, samples: Samples, start: int, start_ns: int | None, timeout_s: float) -> int:
         """Take samples, after ``timeout_s`` at most; returns how many, or a code of SoapySDR."""
         while self._has(Fault.HANG):
             self._clock.sleep(0.1)
-        if not self._header["is_active"] or self._has(Fault.STREAM_ERROR):
+        if not self._header["is_active"] or self._has(Fault.STREAM_ERROR | Fault.GONE):
             return STREAM_ERROR
         if start_ns is not None and self._number["time"] > 1.0:
             return NOT_SUPPORTED
         if self._header["sent"] == 0:
             self._start(start_ns)
-        n = min(len(rows[0]), MTU, max(1, int(self._buffer)))
+        rows = samples[:, 2 * start :].view(np.uint64)
+        n = min(rows.shape[1], MTU, max(1, int(self._buffer)))
         n = self._wait_for_room(n, timeout_s)
         if n == 0:
             return TIMEOUT
         for fault, count in ((Fault.LOST_PACKET, "sequence_errors"), (Fault.LATE_PACKET, "late_packets")):
             if self._drops(fault, count):
                 return n
-        self._keep([row[:n] for row in rows], n)
+        self._keep(rows[:, :n], n)
         return n
 
     def read_status(self, timeout_s: float) -> int:
@@ -257,6 +270,14 @@ class Radio:
                 return TIMEOUT
             self._clock.sleep(PAUSE_S)
 
+    def code_text(self, code: int) -> str:
+        """A code with its name."""
+        return f"{CODES[code]} ({code})"
+
+    def _check_channel(self, channel: int) -> None:
+        if channel >= self.n_channels:
+            raise SoapyError(f"there is no channel {channel}")
+
     def _has(self, fault: Fault) -> bool:
         return bool(int(self._header["fault"]) & fault)
 
@@ -267,11 +288,11 @@ class Radio:
     @property
     def _buffer(self) -> float:
         """Length of its buffer in samples."""
-        return self._number["buffer"] * self.rate_hz
+        return self._number["buffer"] * float(self._header["rate_hz"])
 
     @property
     def _speed_hz(self) -> float:
-        return self.rate_hz * self._number["speed"]
+        return float(self._header["rate_hz"]) * self._number["speed"]
 
     def _start(self, start_ns: int | None) -> None:
         """The channels start together at a time that is not over; otherwise each with its first packet."""
@@ -334,7 +355,7 @@ class Radio:
             wait_s = PAUSE_S if is_stalled else max(1.0, n - free) / self._speed_hz
             self._clock.sleep(min(wait_s, left_s, 0.05))
 
-    def _keep(self, rows: Sequence[NDArray[np.uint64]], n: int) -> None:
+    def _keep(self, rows: NDArray[np.uint64], n: int) -> None:
         header = self._header
         sent = int(header["sent"])
         first = sent % SAMPLES
@@ -348,7 +369,7 @@ class Radio:
             if sent < self._n_record:
                 record.write(row[: self._n_record - sent].tobytes())
         silent = int(header["silent"])
-        if any(row.any() for row in rows):
+        if rows.any():
             header["silence"], silent = silent or header["silence"], 0
         else:
             silent += n
@@ -377,6 +398,12 @@ NUMBERS: Final[Mapping[str, float]] = {
     "detune": 0.0,
 }
 """Arguments that are numbers, and what they are without one."""
+
+
+def read_markup(markup: str) -> dict[str, str]:
+    """Keys and values of a text such as "driver=uhd, type=b200", as SoapySDR reads it."""
+    pairs = (part.partition("=") for part in markup.split(","))
+    return {key.strip(): value.strip() for key, _, value in pairs if key.strip()}
 
 
 def _is_gone(folder: Path) -> bool:

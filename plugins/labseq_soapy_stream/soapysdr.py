@@ -1,32 +1,28 @@
-"""A radio that transmits, through the C interface of SoapySDR 0.8 (loaded on first use)."""
+"""The part of SoapySDR 0.8 that transmits, by its C interface (loaded on first use).
+
+Each method of :class:`SoapyDevice` is one function of SoapySDR. A simulated radio has the same methods.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import sys
-import time
-from collections import Counter
 from collections.abc import Sequence
 from ctypes import POINTER, byref, c_bool, c_char_p, c_double, c_int, c_long, c_longlong, c_size_t, c_void_p
 from functools import cache
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from labseq_soapy_stream.messages import LO_LOCKED, REF_LOCKED, Facts, Setup, unlocked
+from labseq_soapy_stream.output import Samples
 
 TX: Final = 0
 FORMAT: Final = b"CF32"
 TIMEOUT: Final = -1
+STREAM_ERROR: Final = -2
+CORRUPTION: Final = -3
 NOT_SUPPORTED: Final = -5
-ERRORS: Final = {-7: "underflows", -3: "sequence_errors", -6: "late_packets"}
-"""Errors that a stream survives: UNDERFLOW, CORRUPTION and TIME_ERROR -> key of the counts."""
+TIME_ERROR: Final = -6
+UNDERFLOW: Final = -7
 HAS_TIME: Final = 1 << 2
-LOCK_S: Final = 2.0
-"""How long they may take to lock."""
-START_S: Final = 0.1
-"""From setting the time of a start to the start."""
 
 _NAMES: Final = {
     "linux": ("libSoapySDR.so.0.8", "libSoapySDR.so"),
@@ -48,6 +44,10 @@ _INSTALL: Final = {
 
 class SoapyError(Exception):
     """The library, the radio's module or the radio refused something; the text names it."""
+
+
+class LibraryError(SoapyError):
+    """The library cannot be loaded."""
 
 
 class _Range(ctypes.Structure):
@@ -119,7 +119,7 @@ def library() -> Any:
     """The library, its functions with their signatures.
 
     Raises:
-        SoapyError: It cannot be found; the text says how to install it.
+        LibraryError: It cannot be found; the text says how to install it.
     """
     reason = ""
     for name in _NAMES.get(sys.platform, _NAMES["linux"]):
@@ -133,7 +133,7 @@ def library() -> Any:
             getattr(found, f"SoapySDR{function}").argtypes = arguments
         return found
     advice = _INSTALL.get(sys.platform, _INSTALL["linux"])
-    raise SoapyError(f"the library SoapySDR cannot be loaded ({reason}); {advice}")
+    raise LibraryError(f"the library SoapySDR cannot be loaded ({reason}); {advice}")
 
 
 def _call(name: str, *arguments: Any) -> Any:
@@ -145,24 +145,32 @@ def _call(name: str, *arguments: Any) -> Any:
     return result
 
 
-def _stream_error(action: str, code: int) -> SoapyError:
-    return SoapyError(f"{action}: {library().SoapySDR_errToStr(code).decode()} ({code})")
-
-
-class Radio:
+class SoapyDevice:
     """One open radio; all calls come from one thread.
 
     Args:
         arguments: What opens it, for example "driver=uhd,serial=30AD123".
 
     Raises:
-        SoapyError: There is no library, no such device, or it cannot be opened.
+        SoapyError: There is no library, no such device, or it cannot be opened. Methods raise this if the
+            radio's module fails.
     """
 
     def __init__(self, arguments: str) -> None:
         self._device = _call("makeStrArgs", arguments.encode())
         if not self._device:
             raise SoapyError(f"there is no radio '{arguments}'")
+        self._stream: Any = None
+        self._buffers: Any = None
+        self._write, self._status = (
+            library().SoapySDRDevice_writeStream,
+            library().SoapySDRDevice_readStreamStatus,
+        )
+        self._flags, self._mask, self._time = c_int(0), c_size_t(0), c_longlong(0)
+
+    def close(self) -> None:
+        """Close the radio; its stream must be closed."""
+        _call("unmake", self._device)
 
     def identify(self) -> dict[str, str]:
         """Driver, hardware, serial number and the like."""
@@ -177,10 +185,9 @@ class Radio:
         """Number of channels that transmit."""
         return int(_call("getNumChannels", self._device, TX))
 
-    def gain_range(self, channel: int) -> tuple[float, float]:
-        """Lowest and highest gain in dB."""
-        gains = _call("getGainRange", self._device, TX, channel)
-        return gains.minimum, gains.maximum
+    def set_clock_source(self, source: str) -> None:
+        """Choose the reference of its clocks."""
+        _call("setClockSource", self._device, source.encode())
 
     def set(self, what: str, channel: int, value: float | str) -> None:
         """Set "Antenna", "SampleRate", "Bandwidth" or "Gain" of a channel, in Hz or dB."""
@@ -191,246 +198,112 @@ class Radio:
         """Read a value of a channel back: "SampleRate", "Frequency" (of the samples' zero) or "Gain"."""
         return float(_call(f"get{what}", self._device, TX, channel))
 
-    def tune(self, channel: int, frequency_hz: float, offset_hz: float) -> None:
-        """Tune the local oscillator to a frequency plus an offset.
+    def gain_range(self, channel: int) -> tuple[float, float]:
+        """Lowest and highest gain in dB."""
+        gains = _call("getGainRange", self._device, TX, channel)
+        return gains.minimum, gains.maximum
 
-        If the radio can shift the samples digitally their zero stays at the frequency, else it shifts too.
-        """
-        if offset_hz and not self._tunes_digitally(channel):
-            frequency_hz, offset_hz = frequency_hz + offset_hz, 0.0
+    def set_frequency(self, channel: int, frequency_hz: float, offset_hz: float) -> None:
+        """Tune the component RF to a frequency plus an offset, and the other components to what is left."""
         kwargs = library().SoapySDRKwargs_fromString(f"OFFSET={offset_hz!r}".encode() if offset_hz else b"")
         try:
             _call("setFrequency", self._device, TX, channel, frequency_hz, byref(kwargs))
         finally:
             library().SoapySDRKwargs_clear(byref(kwargs))
 
-    def oscillator_hz(self, channel: int) -> float:
-        """Frequency of the local oscillator, where it leaks."""
-        if self._tunes_digitally(channel):
-            return float(_call("getFrequencyComponent", self._device, TX, channel, b"RF"))
-        return self.get("Frequency", channel)
+    def components(self, channel: int) -> set[str]:
+        """Components of the frequency."""
+        return self._names("listFrequencies", TX, channel)
 
-    def locks(self, channels: Sequence[int]) -> dict[str, bool]:
-        """Whether its clocks are locked to their reference, and the local oscillators of channels to them.
+    def component_hz(self, channel: int, name: str) -> float:
+        """A component of the frequency."""
+        return float(_call("getFrequencyComponent", self._device, TX, channel, name.encode()))
 
-        Only sensors that the radio has, by the names of UHD: "ref_locked", "lo_locked" with its channel.
-        """
-        found: dict[str, bool] = {}
-        if REF_LOCKED.encode() in self._names("listSensors"):
-            found[REF_LOCKED] = self._text("readSensor", REF_LOCKED.encode()) == "true"
-        for channel in channels:
-            if LO_LOCKED.encode() in self._names("listChannelSensors", TX, channel):
-                text = self._text("readChannelSensor", TX, channel, LO_LOCKED.encode())
-                found[f"{LO_LOCKED} {channel}"] = text == "true"
-        return found
+    def sensors(self, channel: int | None) -> set[str]:
+        """Sensors of a channel, or of the whole radio."""
+        return (
+            self._names("listSensors") if channel is None else self._names("listChannelSensors", TX, channel)
+        )
 
-    def _tunes_digitally(self, channel: int) -> bool:
-        return {b"RF", b"BB"} <= self._names("listFrequencies", TX, channel)
+    def read_sensor(self, channel: int | None, name: str) -> str:
+        """Value of a sensor."""
+        if channel is None:
+            return self._text("readSensor", name.encode())
+        return self._text("readChannelSensor", TX, channel, name.encode())
 
-    def _names(self, getter: str, *place: int) -> set[bytes]:
-        n_names = c_size_t()
-        names = c_void_p(_call(getter, self._device, *place, byref(n_names)))
-        try:
-            return {*ctypes.cast(names, POINTER(c_char_p))[: n_names.value]} if names else set()
-        finally:
-            library().SoapySDRStrings_clear(byref(names), n_names)
+    @property
+    def has_time(self) -> bool:
+        """Whether it has a clock that can be read."""
+        return bool(_call("hasHardwareTime", self._device, b""))
 
-    def set_clock_source(self, source: str) -> None:
-        """Choose the reference of its clocks."""
-        _call("setClockSource", self._device, source.encode())
+    @property
+    def time_ns(self) -> int:
+        """Its clock."""
+        return int(_call("getHardwareTime", self._device, b""))
 
-    def stream(self, channels: Sequence[int], arguments: str = "") -> Stream:
-        """Set up a stream to these channels, in rising order."""
+    def set_up_stream(self, channels: Sequence[int], arguments: str) -> None:
+        """Set up a stream of complex samples to these channels, in rising order."""
         kwargs = library().SoapySDRKwargs_fromString(arguments.encode())
         numbers = (c_size_t * len(channels))(*channels)
         try:
-            handle = _call("setupStream", self._device, TX, FORMAT, numbers, len(channels), byref(kwargs))
+            self._stream = _call(
+                "setupStream", self._device, TX, FORMAT, numbers, len(channels), byref(kwargs)
+            )
         finally:
             library().SoapySDRKwargs_clear(byref(kwargs))
-        return Stream(self._device, handle, len(channels))
+        self._buffers = (c_void_p * len(channels))()
 
-    def close(self) -> None:
-        """Close the radio."""
-        _call("unmake", self._device)
+    def close_stream(self) -> None:
+        """Close the stream."""
+        _call("closeStream", self._device, self._stream)
+
+    def activate(self) -> int:
+        """Switch the transmitters on; returns a code."""
+        return int(_call("activateStream", self._device, self._stream, 0, 0, 0))
+
+    def deactivate(self) -> int:
+        """Switch the transmitters off; returns a code."""
+        return int(_call("deactivateStream", self._device, self._stream, 0, 0))
+
+    def write(self, samples: Samples, start: int, start_ns: int | None, timeout_s: float) -> int:
+        """Send samples.
+
+        Args:
+            samples: float32 (n_channels, 2 n), I and Q in turn; each row in one piece.
+            start: Index of the first sample to send.
+            start_ns: Time of the radio's clock at which it is played; None: after the one before.
+            timeout_s: How long to wait for room.
+
+        Returns:
+            Number of samples that were taken, or a code.
+        """
+        for i, row in enumerate(samples):
+            self._buffers[i] = row.ctypes.data + 8 * start
+        self._flags.value = 0 if start_ns is None else HAS_TIME
+        n_samples, wait_us = samples.shape[1] // 2 - start, round(timeout_s * 1e6)
+        place = self._device, self._stream, self._buffers
+        return int(self._write(*place, n_samples, byref(self._flags), start_ns or 0, wait_us))
+
+    def read_status(self, timeout_s: float) -> int:
+        """Wait for an event of the stream; returns its code."""
+        places = byref(self._mask), byref(self._flags), byref(self._time)
+        return int(self._status(self._device, self._stream, *places, round(timeout_s * 1e6)))
+
+    def code_text(self, code: int) -> str:
+        """A code with its name."""
+        return f"{library().SoapySDR_errToStr(code).decode()} ({code})"
+
+    def _names(self, getter: str, *place: int) -> set[str]:
+        n_names = c_size_t()
+        names = c_void_p(_call(getter, self._device, *place, byref(n_names)))
+        try:
+            texts = ctypes.cast(names, POINTER(c_char_p))[: n_names.value] if names else []
+            return {text.decode() for text in texts}
+        finally:
+            library().SoapySDRStrings_clear(byref(names), n_names)
 
     def _text(self, getter: str, *arguments: int | bytes) -> str:
         place = _call(getter, self._device, *arguments)
         text = ctypes.string_at(place).decode() if place else ""
         library().SoapySDR_free(place)
         return text
-
-
-class Stream:
-    """A stream of complex samples to all channels at once."""
-
-    def __init__(self, device: Any, handle: Any, n_channels: int) -> None:
-        self._library, self._place = library(), (device, handle)
-        self._buffers = (c_void_p * n_channels)()
-        self._flags, self._mask, self._time = c_int(0), c_size_t(0), c_longlong(0)
-        self._knows_status = True
-        self._errors: Counter[str] = Counter()
-        self._starts_ns = 0
-        self.starts_together = False
-
-    def activate(self) -> None:
-        """Let the first samples start to play: on all channels at one time, if the radio has a clock.
-
-        Raises:
-            SoapyError: The radio refuses to transmit.
-        """
-        if code := _call("activateStream", *self._place, 0, 0, 0):
-            raise _stream_error("starting the stream", code)
-        self.starts_together = bool(_call("hasHardwareTime", self._place[0], b""))
-        if self.starts_together:
-            now_ns = _call("getHardwareTime", self._place[0], b"")
-            self._starts_ns = now_ns + round(START_S * 1e9)
-        self._activated_s = time.monotonic()
-
-    def check_start(self) -> None:
-        """Find out whether the first samples came in time; does not wait until they are played."""
-        left_s = self._activated_s + START_S / 2 - time.monotonic()
-        if self.starts_together and self.errors(max(0.0, left_s))["late_packets"]:
-            self.starts_together = False
-
-    def write(self, samples: NDArray[np.float32], start: int, timeout_s: float) -> int:
-        """Write samples to the stream.
-
-        Args:
-            samples: float32 (n_channels, 2 n), I and Q in turn; each row in one piece.
-            start: Index of the first sample to write.
-            timeout_s: How long to wait for room.
-
-        Returns:
-            Number of samples that the radio took; 0 if there was no room in time.
-
-        Raises:
-            SoapyError: The stream is broken.
-        """
-        n_samples = samples.shape[1] // 2 - start
-        for i, row in enumerate(samples):
-            self._buffers[i] = row.ctypes.data + 8 * start
-        self._flags.value = HAS_TIME if self._starts_ns else 0
-        wait_us = round(timeout_s * 1e6)
-        n_taken = self._library.SoapySDRDevice_writeStream(
-            *self._place, self._buffers, n_samples, byref(self._flags), self._starts_ns, wait_us
-        )
-        if n_taken > 0:
-            self._starts_ns = 0
-        elif n_taken == NOT_SUPPORTED and self._starts_ns:  # it has a clock, but not for this
-            self._starts_ns, self.starts_together = 0, False
-            return self.write(samples, start, timeout_s)
-        elif n_taken in ERRORS:
-            self._errors[ERRORS[n_taken]] += 1
-        elif n_taken not in {0, TIMEOUT}:
-            raise _stream_error("writing to the stream", n_taken)
-        return max(0, n_taken)
-
-    def errors(self, timeout_s: float = 0.0) -> Counter[str]:
-        """How often the radio reported each of :data:`ERRORS` since the last call; waits for the first."""
-        while self._knows_status:
-            code = self._library.SoapySDRDevice_readStreamStatus(
-                *self._place, byref(self._mask), byref(self._flags), byref(self._time), round(timeout_s * 1e6)
-            )
-            if code in ERRORS:
-                self._errors[ERRORS[code]] += 1
-                timeout_s = 0.0
-                continue
-            if code == NOT_SUPPORTED:
-                self._knows_status = False
-            elif code < 0 and code != TIMEOUT:
-                raise _stream_error("the stream's status", code)
-            break
-        found, self._errors = self._errors, Counter()
-        return found
-
-    def close(self) -> None:
-        """Stop playing and close the stream.
-
-        Raises:
-            SoapyError: The radio does not obey: its transmitters may still be on.
-        """
-        try:
-            code = _call("deactivateStream", *self._place, 0, 0)
-        finally:
-            _call("closeStream", *self._place)
-        if code:
-            raise _stream_error("stopping the stream", code)
-
-
-def open_radio(setup: Setup) -> Radio:
-    """Open the radio.
-
-    Raises:
-        SoapyError: There is none, another program has it, or it has too few channels.
-    """
-    library()
-    try:
-        radio = Radio(setup.device)
-    except SoapyError as error:
-        hint = "`SoapySDRUtil --find` lists the radios that are connected"
-        raise SoapyError(f"'{setup.device}' cannot be opened: {error}; {hint}") from error
-    n_channels, needed = radio.n_channels, max(setup.channels) + 1
-    if n_channels < needed:
-        radio.close()
-        text = f"it has {n_channels} channel(s) that transmit; expected {needed}, one for each AOD"
-        raise SoapyError(text)
-    return radio
-
-
-def set_up(radio: Radio, setup: Setup) -> Stream:
-    """Set up both channels and their stream.
-
-    Raises:
-        SoapyError: The radio refuses something.
-    """
-    if setup.clock_source:
-        radio.set_clock_source(setup.clock_source)
-    for channel, gain_db in zip(setup.channels, setup.gain_db, strict=True):
-        radio.set("SampleRate", channel, setup.rate_hz)
-        if setup.bandwidth_hz is not None:
-            radio.set("Bandwidth", channel, setup.bandwidth_hz)
-        if setup.antenna:
-            radio.set("Antenna", channel, setup.antenna)
-        radio.tune(channel, setup.oscillator_hz, setup.lo_offset_hz)
-        lowest, highest = radio.gain_range(channel)
-        if gain_db is not None and not lowest <= gain_db <= highest:
-            text = f"a gain of {gain_db:g} dB; channel {channel} has {lowest:g} to {highest:g} dB"
-            raise SoapyError(text)
-        radio.set("Gain", channel, lowest if gain_db is None else gain_db)
-    return radio.stream(sorted(setup.channels), setup.stream)
-
-
-def read_back(radio: Radio, setup: Setup) -> Facts:
-    """Read the values of both channels back, after the stream is set up: some radios change them then.
-
-    Raises:
-        SoapyError: Its channels have different rates.
-    """
-    rates = [radio.get("SampleRate", channel) for channel in setup.channels]
-    if rates[0] != rates[1]:
-        raise SoapyError(f"its channels have different sample rates: {rates[0]:.10g} and {rates[1]:.10g} Hz")
-    end_s = time.monotonic() + LOCK_S
-    while unlocked(locks := radio.locks(setup.channels), setup.clock_source) and time.monotonic() < end_s:
-        time.sleep(LOCK_S / 100)
-    return Facts(
-        radio=radio.identify(),
-        rate_hz=rates[0],
-        zero_hz=[radio.get("Frequency", channel) for channel in setup.channels],
-        oscillator_hz=[radio.oscillator_hz(channel) for channel in setup.channels],
-        gain_db=[radio.get("Gain", channel) for channel in setup.channels],
-        locks=locks,
-    )
-
-
-def lower_gains(device: str, channels: Sequence[int]) -> None:
-    """Open a radio that a killed process left transmitting, set the lowest gains, and close it.
-
-    Raises:
-        SoapyError: It cannot be opened, or refuses something.
-    """
-    radio = Radio(device)
-    try:
-        for channel in channels:
-            radio.set("Gain", channel, radio.gain_range(channel)[0])
-    finally:
-        radio.close()

@@ -26,7 +26,8 @@ import numpy as np
 
 from labseq_soapy_stream.messages import Setup, received, send
 from labseq_soapy_stream.output import BLOCK, Output, Samples
-from labseq_soapy_stream.soapysdr import Radio, SoapyError, Stream, lower_gains, open_radio, read_back, set_up
+from labseq_soapy_stream.radio import Device, OpenDevice, Stream, lower_gains, open_radio, read_back, set_up
+from labseq_soapy_stream.soapysdr import SoapyDevice, SoapyError
 
 STALL_S: Final = 2.0
 """A stream that takes no samples for so long is dead."""
@@ -231,10 +232,12 @@ def raise_priority() -> str:
     return ""
 
 
-def stream(commands: CommandReader, messages: StatusWriter, no_real_time: str) -> None:
+def stream(
+    open_device: OpenDevice, commands: CommandReader, messages: StatusWriter, no_real_time: str
+) -> None:
     """Open the radio, stream, close it."""
     setup = commands.setup
-    radio = open_radio(setup)
+    radio = open_radio(open_device, setup)
     opened = Path(setup.marker).with_suffix(".opened")  # it stays if this process is killed
     with contextlib.suppress(OSError):
         opened.write_text(str(os.getpid()), "ascii")
@@ -257,7 +260,7 @@ def stream(commands: CommandReader, messages: StatusWriter, no_real_time: str) -
         remove_own(Path(setup.marker))
 
 
-def closed(part: Radio | Stream) -> bool:
+def closed(part: Device | Stream) -> bool:
     """Close a radio or its stream; returns whether it obeyed. An error that came before is reported."""
     with contextlib.suppress(SoapyError):
         part.close()
@@ -272,11 +275,11 @@ def remove_own(file: Path) -> None:
             file.unlink()
 
 
-def main() -> int:
+def main(open_device: OpenDevice) -> int:
     """Run the process; returns its exit code."""
     if sys.argv[1:2] == ["--off"]:
         try:
-            lower_gains(sys.argv[2], [int(channel) for channel in sys.argv[3:]])
+            lower_gains(open_device, sys.argv[2], [int(channel) for channel in sys.argv[3:]])
         except SoapyError as error:
             sys.stderr.write(f"{error}\n")
             return 3
@@ -288,7 +291,7 @@ def main() -> int:
     commands, messages = CommandReader(0), StatusWriter(pipe)
     gc.disable()  # nothing here creates reference cycles
     try:
-        stream(commands, messages, no_real_time)
+        stream(open_device, commands, messages, no_real_time)
     except SoapyError as error:
         messages.post({"failed": str(error)})
         messages.finish()
@@ -297,12 +300,16 @@ def main() -> int:
     return 0
 
 
-def run() -> NoReturn:
-    """Run the process, and end it."""
-    code = main()
+def run(open_device: OpenDevice) -> NoReturn:
+    """Run the process, and end it.
+
+    Args:
+        open_device: Opens a radio by its arguments.
+    """
+    code = main(open_device)
     sys.stderr.flush()
     os._exit(code)  # the threads wait for labseq
 
 
 if __name__ == "__main__":
-    run()
+    run(SoapyDevice)

@@ -1,5 +1,5 @@
-// A radio for the real libSoapySDR, to compare it with the simulated library: what labseq_soapy_sim/device.py
-// does, without its shared memory and faults. The SoapySDR device "capture".
+// A radio for the real libSoapySDR, to compare with the simulated one: what labseq_soapy_sim/device.py does,
+// without its shared memory and faults. The SoapySDR device "capture".
 //
 // Arguments: folder (of its files), record (above 0: files with the samples and changes of the transmitters),
 // channels, buffer (s), components, time, delay (s), unlocked, detune (Hz), fault; as those of the simulated radio.

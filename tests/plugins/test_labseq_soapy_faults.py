@@ -59,7 +59,7 @@ def link_of(rig: Rig) -> Any:
         ("channels=1", {}, r"1 channel\(s\) that transmit; expected 2"),
         ("coerce_rate=1000000", {}, "1000000 samples per second; expected 1200000: choose a sample_rate"),
         ("speed=1", {"column_gain": 70.0}, "70 dB; channel 1 has 0 to 60 dB"),
-        ("speed=1", {"antenna": "RX2"}, "setAntenna: there is no antenna RX2"),
+        ("speed=1", {"antenna": "RX2"}, "there is no antenna RX2"),
         ("fault=inactive", {}, r"starting the stream: STREAM_ERROR \(-2\)"),
         ("detune=13000", {}, "local oscillator to 100028000 Hz; expected 100015000 Hz"),
     ],

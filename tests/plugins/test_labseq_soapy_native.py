@@ -1,19 +1,21 @@
-"""The simulated library and the real libSoapySDR do the same for the driver, with the same radio."""
+"""The simulated radio does the same for the driver as a radio behind the real libSoapySDR."""
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Callable
-from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from labseq_soapy_sim import SimulatedLibrary, installed, read_trace
-from labseq_soapy_stream import soapysdr
-from labseq_soapy_stream.messages import Setup
-from labseq_soapy_stream.soapysdr import SoapyError, open_radio, read_back, set_up
+from labseq_soapy_sim import SimulatedDevice, read_trace
+from labseq_soapy_stream import radio as radio_module
+from labseq_soapy_stream.messages import Facts, Setup
+from labseq_soapy_stream.radio import Device, OpenDevice, open_radio, read_back, set_up
+from labseq_soapy_stream.soapysdr import SoapyDevice, SoapyError
 
 from .labseq_soapy_rig import opened, recorded
 
@@ -38,10 +40,21 @@ def attempt(call: Callable[[], object]) -> object:
     try:
         return call()
     except SoapyError as error:
-        return str(error)
+        return plain(error)
 
 
-def use(folder: Path, arguments: str, **settings: Any) -> list[object]:
+def plain(error: SoapyError) -> str:
+    """The text of an error without the names of C functions and classes."""
+    return re.sub(r"SoapySDR::Device::make\(\) |\b[a-z]+[A-Z]\w+: ", "", str(error))
+
+
+def facts(radio: Device, setup: Setup) -> Facts:
+    """What is read back, without the version of the library."""
+    found = read_back(radio, setup)
+    return replace(found, radio={key: text for key, text in found.radio.items() if key != "SoapySDR"})
+
+
+def use(open_device: OpenDevice, folder: Path, arguments: str, **settings: Any) -> list[object]:
     """All that the driver learns of a radio from opening to closing it, with an underflow in between."""
     values: dict[str, Any] = {
         "device": f"driver=capture,record=100000000,buffer=0.2,{arguments},folder=.",
@@ -58,19 +71,19 @@ def use(folder: Path, arguments: str, **settings: Any) -> list[object]:
     setup = Setup(**(values | settings), ramp_s=0.0, max_wait_s=1.0, hold=False, marker="")
     results: list[object] = []
     try:
-        radio = open_radio(setup)
+        radio = open_radio(open_device, setup)
     except SoapyError as error:
-        return [str(error)]
+        return [plain(error)]
     results += [radio.n_channels, radio.gain_range(0), attempt(lambda: radio.gain_range(7))]
     results.append(attempt(lambda: radio.get("SampleRate", 7)))
     try:
         stream = set_up(radio, setup)
     except SoapyError as error:
         radio.close()
-        return [*results, str(error)]
+        return [*results, plain(error)]
     block = np.arange(2 * 2 * 20_000, dtype=np.float32).reshape(2, -1)
     results += [
-        read_back(radio, setup),
+        facts(radio, setup),
         attempt(lambda: stream.write(block, 0, 0.0)),
         attempt(stream.activate),
     ]
@@ -85,7 +98,7 @@ def use(folder: Path, arguments: str, **settings: Any) -> list[object]:
     stream.close()
     radio.close()
     trace = [(name, *gain) for _, name, *gain in read_trace(folder) if name != "play"]
-    return [*results, trace, recorded(folder, 1)[:17_000].tolist(), attempt(radio.close)]
+    return [*results, trace, recorded(folder, 1)[:17_000].tolist()]
 
 
 @pytest.mark.parametrize(
@@ -109,15 +122,13 @@ def test_the_driver_learns_the_same_of_a_radio(
     tmp_path: Path, module: Path, monkeypatch: pytest.MonkeyPatch, arguments: str, settings: dict[str, Any]
 ) -> None:
     monkeypatch.setenv("SOAPY_SDR_PLUGIN_PATH", str(module))
-    monkeypatch.setattr(soapysdr, "START_S", 0.5)  # of notice, also on a busy computer
+    monkeypatch.setattr(radio_module, "START_S", 0.5)  # of notice, also on a busy computer
     learned: list[list[object]] = []
-    for library in (installed(SimulatedLibrary()), nullcontext()):
+    for open_device in (SimulatedDevice, SoapyDevice):
         folder = tmp_path / str(len(learned))
         folder.mkdir()
         monkeypatch.chdir(folder)
-        soapysdr.library.cache_clear()
-        with library:
-            learned.append(use(folder, arguments, **settings))
+        learned.append(use(open_device, folder, arguments, **settings))
     assert learned[0] == learned[1]
 
 
@@ -132,7 +143,13 @@ def test_a_run_of_the_driver_sends_the_same_samples(
         with opened(device=f"{device},buffer=0.2,record=100000000,folder={folder}", row_gain=12.1) as rig:
             rig.tweezers.start()
             rig.tweezers.ramp(0.5, 0.01)
-            described = {**rig.tweezers.describe(), "device": "", "notes": "", "no_real_time": ""}
+            described: dict[str, Any] = {
+                **rig.tweezers.describe(),
+                "device": "",
+                "notes": "",
+                "no_real_time": "",
+            }
+            described["radio"] = described["radio"]["driver"]
         names = [name for _, name, *_ in read_trace(folder) if name != "play"]
         samples = recorded(folder)
         first = int(np.flatnonzero(samples)[0])
