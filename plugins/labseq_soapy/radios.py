@@ -1,6 +1,6 @@
 """Radios and their connections: what each carries, and whether it can shift the samples digitally.
 
-Figures and where they are from: README.md, "The connection".
+Figures and where they are from: docs/how-to/static-tweezers-soapy.md, "The connection".
 """
 
 from __future__ import annotations

@@ -82,11 +82,6 @@ class SoapySettings(Settings):
         default=10,
         description="the same for packets of samples that are lost or late on the way to the radio",
     )
-    on_exit: Literal["ramp_down", "hold"] = Field(
-        default="ramp_down",
-        description="the light when labseq is killed or hangs: ramped down, or held until labseq opens "
-        "the radio again",
-    )
     after_run: Literal["off", "on"] = Field(
         default="off",
         description="the light after a run that took all its shots: ramped down, or left on until the next "

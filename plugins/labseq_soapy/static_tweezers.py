@@ -50,8 +50,8 @@ NO_REAL_TIME: Final = (
 class SoapyStaticTweezers(StaticTweezers):
     """Plays a loop of tones for each AOD on two outputs of a radio.
 
-    A separate process streams samples to the radio. It ramps the light down if labseq is killed or hangs,
-    unless the profile says otherwise. The depth of a tweezer is proportional to the product of the powers
+    A separate process streams samples to the radio. It ramps the light down if labseq is killed or hangs.
+    The depth of a tweezer is proportional to the product of the powers
     of its two tones, so both amplitudes scale with the fourth root of the depth.
 
     Calls that need the light raise ``DeviceError`` if the stream is dead, and once ``TransientError`` if the
@@ -209,8 +209,8 @@ class SoapyStaticTweezers(StaticTweezers):
         return True
 
     def emergency(self) -> Emergency | None:
-        """The streaming process is ended, and closes the radio; None if the light is to be held."""
-        if self._link is None or self._settings.on_exit == "hold":
+        """The streaming process is ended, and closes the radio; None if it is not open."""
+        if self._link is None:
             return None
         return Emergency(Path(__file__).with_name("emergency.py"), self._link.emergency_arguments())
 
@@ -293,7 +293,6 @@ class SoapyStaticTweezers(StaticTweezers):
             clock_source=settings.clock_source,
             ramp_s=settings.switch,
             max_wait_s=settings.patience,
-            hold=settings.on_exit == "hold",
             marker=str(marker),
         )
         options = [] if settings.is_simulated else ["--real-time"]

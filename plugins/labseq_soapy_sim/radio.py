@@ -15,26 +15,10 @@ from numpy.typing import NDArray
 from labseq.plugin import Simulation, setting_error
 from labseq.plugin.messages import clean, closest, one_of
 from labseq.plugin.simulation import ReceivesOutput
+from labseq_soapy_sim.device import DRIVER, NUMBERS
 from labseq_soapy_sim.outputs import CapturedOutputs
 from labseq_soapy_sim.ring import Ring
 
-DEFAULTS: Final[Mapping[str, str]] = {"speed": "0.1", "buffer": "0.002", "patience": "60", "leakage": "0.003"}
-"""A tenth of real time costs a tenth of the work. On a busy computer samples sometimes come late: the
-radio's clock then waits for them, so that equal runs give equal atoms."""
-LEAST: Final[Mapping[str, float]] = {
-    "speed": 1e-4,
-    "buffer": 1e-4,
-    "patience": 0.0,
-    "record": 0.0,
-    "channels": 1.0,
-    "coerce_rate": 0.0,
-    "leakage": 0.0,
-    "time": 0.0,
-    "delay": 0.0,
-    "components": 1.0,
-    "detune": -1e9,
-}
-"""Arguments that are numbers, and their lowest values."""
 WORDS: Final[Mapping[str, tuple[str, ...]]] = {
     "fault": ("absent", "inactive"),
     "folder": (),
@@ -59,7 +43,7 @@ def read_arguments(device: str) -> dict[str, str]:
 
 
 def _check_argument(key: str, value: str) -> None:
-    known = (*LEAST, *WORDS)
+    known = (*NUMBERS, *WORDS)
     if key not in known:
         nearest = closest(key, known)
         hint = f"did you mean '{nearest}'?" if nearest else ""
@@ -74,8 +58,9 @@ def _check_argument(key: str, value: str) -> None:
         number = float(value)
     except ValueError:
         number = math.nan
-    if not LEAST[key] <= number < math.inf:
-        raise setting_error(came, f"a number, at least {LEAST[key]:g}", at=("device",))
+    _, least = NUMBERS[key]
+    if not least <= number < math.inf:
+        raise setting_error(came, f"a number, at least {least:g}", at=("device",))
 
 
 class SimulatedRadio:
@@ -116,7 +101,7 @@ class SimulatedRadio:
             The arguments that open it, the module that streams to it, and a folder for logs.
         """
         self.folder = Path(self._arguments["folder"] if self._given else tempfile.mkdtemp(prefix="labseq-"))
-        arguments = {"driver": "capture", **DEFAULTS, **self._arguments, "folder": str(self.folder)}
+        arguments = {"driver": DRIVER, **self._arguments, "folder": str(self.folder)}
         return ",".join(f"{key}={value}" for key, value in arguments.items()), STREAMER, self.folder
 
     def started(self, tones_hz: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:

@@ -47,8 +47,7 @@ class Setup:
         clock_source: Reference of its clocks; "": as the radio chooses.
         ramp_s: Duration of the ramp to zero at its end.
         max_wait_s: How long labseq may be silent.
-        hold: Whether to continue without labseq.
-        marker: File that the process writes when it continues without labseq; deleting it ends the process.
+        marker: File that the process writes when it goes on without labseq; deleting it ends the process.
     """
 
     device: str
@@ -63,7 +62,6 @@ class Setup:
     clock_source: str
     ramp_s: float
     max_wait_s: float
-    hold: bool
     marker: str
 
 

@@ -146,8 +146,7 @@ class Streamer:
                 self._output.release(message["n_samples"])
                 self._begin(message["id"])
             case "leave":
-                self._setup = replace(self._setup, hold=True)
-                self._continue_alone("")
+                self._go_alone()
                 self._post({"done": message["id"]})
             case "end":
                 self._leave("")
@@ -194,18 +193,19 @@ class Streamer:
                 if not Path(self._setup.marker).exists():
                     self._leave("")
         elif self._commands.closed or os.getppid() != self._parent:  # a copy of labseq may keep the pipe open
-            self._continue_alone("labseq is gone")
-        elif not self._setup.hold and now_s - self._commands.last_s > self._setup.max_wait_s:
-            self._continue_alone(f"labseq sent nothing for {self._setup.max_wait_s:g} s")
+            self._go_alone()
+            self._leave("labseq is gone")
+        elif now_s - self._commands.last_s > self._setup.max_wait_s:
+            self._go_alone()
+            self._leave(f"labseq sent nothing for {self._setup.max_wait_s:g} s")
 
-    def _continue_alone(self, why: str) -> None:
+    def _go_alone(self) -> None:
+        """Leave the number of this process to the next labseq, which ends it, or waits until it has ended."""
         self._alone = True
         marker = Path(self._setup.marker)
         with contextlib.suppress(OSError):
             marker.parent.mkdir(parents=True, exist_ok=True)
             marker.write_text(str(os.getpid()), "ascii")
-        if not self._setup.hold:
-            self._leave(why)
 
     def _leave(self, why: str) -> None:
         self._leaving = True

@@ -26,7 +26,6 @@ from labseq.errors import StopRequested
 from .labseq_soapy_rig import (
     SMALL,
     Rig,
-    another_labseq,
     assert_ramped_down,
     made,
     opened,
@@ -279,24 +278,6 @@ def test_the_light_is_ramped_down_by_a_signal_and_when_labseq_hangs(
         with pytest.raises(DeviceError, match=text):
             rig.tweezers.start()
     assert_ramped_down(tmp_path)
-
-
-def test_with_hold_the_light_stays_until_the_next_labseq_ends_it(tmp_path: Path) -> None:
-    def alone() -> list[Path]:
-        return list((Path(os.environ["LABSEQ_STATE"]) / "soapy").glob("*.alone"))
-
-    with another_labseq(tmp_path, on_exit="hold") as (labseq, script):
-        assert script is None, "the light is to stay"
-        ring = Ring(tmp_path)
-        labseq.kill()
-        labseq.wait()
-        until(lambda: any(alone()))
-        assert ring.is_playing
-        assert np.abs(ring.latest(100)).max() > 0.1
-    with opened(arguments=f"folder={tmp_path},record=10000000", on_exit="hold") as rig:
-        assert not any(alone())
-        assert not rig.ring.latest(100).any()
-        rig.tweezers.start()
 
 
 def test_left_on_after_the_run_the_light_stays_until_the_next_labseq_ends_it(tmp_path: Path) -> None:

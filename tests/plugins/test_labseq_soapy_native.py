@@ -57,7 +57,7 @@ def facts(radio: Device, setup: Setup) -> Facts:
 def use(open_device: OpenDevice, folder: Path, arguments: str, **settings: Any) -> list[object]:
     """All that the driver learns of a radio from opening to closing it, with an underflow in between."""
     values: dict[str, Any] = {
-        "device": f"driver=capture,record=100000000,buffer=0.2,{arguments},folder=.",
+        "device": f"driver=capture,speed=1,patience=0,record=100000000,buffer=0.2,{arguments},folder=.",
         "stream": "WIRE=sc16, size = 3",
         "channels": (1, 0),
         "rate_hz": 1.2e6,
@@ -68,7 +68,7 @@ def use(open_device: OpenDevice, folder: Path, arguments: str, **settings: Any) 
         "antenna": "TX/RX",
         "clock_source": "external",
     }
-    setup = Setup(**(values | settings), ramp_s=0.0, max_wait_s=1.0, hold=False, marker="")
+    setup = Setup(**(values | settings), ramp_s=0.0, max_wait_s=1.0, marker="")
     results: list[object] = []
     try:
         radio = open_radio(open_device, setup)

@@ -41,7 +41,7 @@ class Bench:
 def streaming(folder: Path, *, lo_offset_hz: float = 0.0) -> Generator[Bench]:
     """A radio that was opened, set up and activated at 1.2 MS/s; closed after the block."""
     setup = Setup(
-        device=f"driver=capture,buffer=0.02,folder={folder}",
+        device=f"driver=capture,speed=1,patience=0,buffer=0.02,folder={folder}",
         channels=(0, 1),
         rate_hz=1.2e6,
         oscillator_hz=100e6,
@@ -49,7 +49,6 @@ def streaming(folder: Path, *, lo_offset_hz: float = 0.0) -> Generator[Bench]:
         clock_source="",
         ramp_s=0.0,
         max_wait_s=1.0,
-        hold=False,
         marker="",
         stream="",
         lo_offset_hz=lo_offset_hz,
@@ -113,7 +112,7 @@ def streamer(bench: Bench, *messages: dict[str, Any]) -> tuple[Streamer, list[An
     inbox, posted = queue.SimpleQueue[dict[str, Any]](), list[Any]()
     for message in messages:
         inbox.put(message)
-    setup = SimpleNamespace(ramp_s=0.1, hold=False, max_wait_s=5.0)
+    setup = SimpleNamespace(ramp_s=0.1, max_wait_s=5.0)
     commands = SimpleNamespace(inbox=inbox, closed=False, last_s=float("inf"), setup=setup)
     return Streamer(bench.stream, 1.2e6, cast("Any", commands), posted.append), posted
 
