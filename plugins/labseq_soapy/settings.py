@@ -73,14 +73,10 @@ class SoapySettings(Settings):
         default=10e-3,
         description="duration of the ramps that turn the array on, and off in the safe state",
     )
-    max_underflows: Annotated[int, Field(ge=0)] = Field(
+    max_disturbances: Annotated[int, Field(ge=0)] = Field(
         default=10,
-        description="how often the radio may run out of samples in a minute while the array is on; each time "
-        "the shot is repeated, above it the run ends",
-    )
-    max_lost_packets: Annotated[int, Field(ge=0)] = Field(
-        default=10,
-        description="the same for packets of samples that are lost or late on the way to the radio",
+        description="how often the radio may run out of samples, or miss a packet of them, in a minute while "
+        "the array is on; each time the shot is repeated, above it the run ends",
     )
     after_run: Literal["off", "on"] = Field(
         default="off",

@@ -35,11 +35,12 @@ LATENCY_S: Final = 30e-3
 Measured: 26 to 34 ms with the simulated radio, which buffers 20 ms. A real one says how much once open.
 """
 MINUTE_S: Final = 60.0
-FAULTS: Final = {
-    "ran out of samples": ("max_underflows", ("underflows",)),
-    "missed packets": ("max_lost_packets", ("sequence_errors", "late_packets")),
+DISTURBANCES: Final = {
+    "underflows": "ran out of samples",
+    "sequence_errors": "missed packets",
+    "late_packets": "missed packets",
 }
-"""What the radio did -> the setting that limits it, the errors that it reports."""
+"""Error that the radio reports -> what it did."""
 APART: Final = "it had no timed start, or too late: rows and columns may be some microseconds apart"
 NO_REAL_TIME: Final = (
     "the streaming process has no real-time priority ({}): a busy computer may let the radio run out of "
@@ -77,7 +78,7 @@ class SoapyStaticTweezers(StaticTweezers):
         self._amplitudes: Amplitudes | None = None
         self._depth: float | None = 0.0  # None: a ramp was interrupted
         self._seen: Mapping[str, int] = {}  # errors while the array was on
-        self._recent: deque[tuple[float, Counter[str]]] = deque()  # when the radio did what how often
+        self._recent: deque[tuple[float, int]] = deque()  # when the radio reported how many errors
         self._link: Link | None = None
         self._facts: Facts | None = None
         self._is_loaded = False
@@ -269,7 +270,7 @@ class SoapyStaticTweezers(StaticTweezers):
     def poll(self) -> Mapping[str, int]:
         """How often the radio has reported each error since it was opened, recorded with each shot."""
         counts = {} if self._link is None else self._link.status["all"]
-        return {key: counts.get(key, 0) for _, keys in FAULTS.values() for key in keys}
+        return {key: counts.get(key, 0) for key in DISTURBANCES}
 
     def _notes(self, facts: Facts) -> list[str]:
         notes = [] if facts.starts_together else [APART]
@@ -325,20 +326,26 @@ class SoapyStaticTweezers(StaticTweezers):
         link.check()
         counts = link.status["lit"]
         new, self._seen = Counter(counts) - Counter(self._seen), counts
-        now_s = self._clock.now()
-        while self._recent and self._recent[0][0] < now_s - MINUTE_S:
-            self._recent.popleft()
         if not new:
             return link
-        did = Counter({what: sum(new[key] for key in keys) for what, (_, keys) in FAULTS.items()})
-        self._recent.append((now_s, did))
-        for what, (setting, _) in FAULTS.items():
-            count, limit = sum(one[what] for _, one in self._recent), getattr(self._settings, setting)
-            if did[what] and count > limit:
-                text = f"the radio {what} {count} time(s) within a minute while the array was on"
-                raise DeviceError(self._name, f"{text}; {setting} allows {limit}")
-        texts = " and ".join(f"{what} {count} time(s)" for what, count in did.items() if count)
-        raise TransientError(f"the radio {texts} while the array was on: atoms may be lost", self._name)
+        did: Counter[str] = Counter()
+        for key, count in new.items():
+            did[DISTURBANCES[key]] += count
+        text = " and ".join(f"{what} {count} time(s)" for what, count in did.items())
+        text = f"the radio {text} while the array was on"
+        limit, n_recent = self._settings.max_disturbances, self._n_recent(new.total())
+        if n_recent > limit:
+            text = f"{text}, and had {n_recent} disturbances within a minute"
+            raise DeviceError(self._name, f"{text}; max_disturbances allows {limit}")
+        raise TransientError(f"{text}: atoms may be lost", self._name)
+
+    def _n_recent(self, n_new: int) -> int:
+        """Errors within the last minute, with new ones."""
+        now_s = self._clock.now()
+        self._recent.append((now_s, n_new))
+        while self._recent[0][0] < now_s - MINUTE_S:
+            self._recent.popleft()
+        return sum(count for _, count in self._recent)
 
     def _disconnect(self) -> None:
         link, self._link, self._facts = self._link, None, None

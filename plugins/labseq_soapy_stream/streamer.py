@@ -126,7 +126,9 @@ class Streamer:
             while not self._commands.inbox.empty():
                 self._execute(self._commands.inbox.get())
             self._write(self._output.block())
-            self._check()
+            self._report_errors()
+            if not self._leaving:
+                self._watch_labseq()
 
     def terminate(self, *_: object) -> None:
         """Ramp down and end; handler of a signal."""
@@ -173,18 +175,20 @@ class Streamer:
             self._post({"done": self._task})
             self._task = None
 
-    def _check(self) -> None:
+    def _report_errors(self) -> None:
+        """Count what the radio reports, and tell labseq at once, or that there is nothing now and then."""
         found = self._stream.errors()
         self._errors["all"].update(found)
         if self._output.depth > 0.0:
             self._errors["lit"].update(found)
         now_s = time.monotonic()
-        if found or now_s - self._status_s > STATUS_S:
+        if not self._alone and (found or now_s - self._status_s > STATUS_S):
             self._status_s = now_s
-            if not self._alone:
-                self._post({"status": {when: dict(counts) for when, counts in self._errors.items()}})
-        if self._leaving:
-            return
+            self._post({"status": {when: dict(counts) for when, counts in self._errors.items()}})
+
+    def _watch_labseq(self) -> None:
+        """Leave if labseq is gone or hangs, or, without it, if the next labseq has deleted the marker."""
+        now_s = time.monotonic()
         if self._terminated:
             self._leave("it was asked to end by a signal")
         elif self._alone:
