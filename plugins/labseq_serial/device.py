@@ -98,6 +98,7 @@ class Instrument:
 
         if command.makes and self._differing(command.makes) is None:
             return
+        # a toggle whose reply was lost may have been carried out: only the profile knows what may be repeated
         self._retried(send) if command.repeatable else send()
         end_s = self._clock.now() + timeout_s
         while (differing := self._differing(command.makes)) is not None:
@@ -352,6 +353,7 @@ class SerialDevice(Device):
             for name in self._settings.on_open:
                 instrument.carry_out(name, {})
         except LabseqError:
+            # half set up, with the port about to be closed: nothing else would make it safe
             instrument.carry_out_all(self._settings.safe_state)
             raise
 

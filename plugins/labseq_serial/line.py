@@ -94,10 +94,10 @@ class Line:
         end = settings.read_ends_with.encode(settings.encoding) if answered else b""
         try:
             with self._unbroken(text, timeout_s):
-                self._port.reset_input_buffer()
+                self._port.reset_input_buffer()  # a late reply must not count as that to this text
                 self._port.write(sent)
             came = self._receive(text, sent if settings.echo else b"", end, timeout_s)
-        finally:
+        finally:  # it may be busy although its reply was lost
             self._free_s = self._clock.now() + settings.pause
         try:
             return came.decode(settings.encoding).strip()

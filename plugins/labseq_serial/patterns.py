@@ -56,8 +56,8 @@ def pieces(text: str) -> list[Piece]:
         parts = list(string.Formatter().parse(text))
     except ValueError as error:
         raise ValueError(f"'{text}' is not a template: {error}; {expected}") from None
-    for _, name, spec, conversion in parts:
-        if name is not None and (not name.isidentifier() or conversion or "{" in (spec or "")):
+    for _, name, _, conversion in parts:
+        if conversion or not (name or "x").isidentifier():
             raise ValueError(f"the placeholder '{{{name}}}' is not the name of an argument; {expected}")
     return [Piece(literal, name or "", spec or "") for literal, name, spec, _ in parts]
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from labseq.plugin import Duration, PositiveDuration, Settings, Text, setting_error
 from labseq.plugin.messages import clean, closest, one_of
@@ -17,9 +18,9 @@ from labseq_serial.values import ArgumentSettings, Scalar, ValueSettings, placed
 RESERVED: Final = frozenset({"self", "name", "owner", "timeout_s", "function"})
 """Names that arguments cannot have, because labseq's own calls use them."""
 _SLACK: Final = 1e-9
+"""Part of a limit by which the conversion of units may miss it."""
 SIMULATED: Final = "simulated"
 """The port of a simulated instrument."""
-_SCHEMES: Final = ("socket", "rfc2217")
 _MADE: Final[Mapping[str, tuple[type[Scalar], str]]] = {
     "bool": (bool, "true or false"),
     "int": (int, "a whole number"),
@@ -139,10 +140,7 @@ class CommandSettings(Settings):
             raise placed(error, "send") from None
         for name in names:
             if name not in self.arguments:
-                meant = closest(name, self.arguments)
-                hint = f"did you mean '{meant}'?" if meant else f"declare '{name}' below 'arguments'"
-                expected = one_of(list(self.arguments)) or "no placeholder: the command has no arguments"
-                raise setting_error(f"'{{{name}}}' is not an argument", expected, hint, at=("send",))
+                raise unknown(f"'{{{name}}}' is not an argument", name, self.arguments, "send")
         for name in self.arguments:
             if name not in names:
                 what = f"the argument '{name}' has no place in '{clean(self.send)}'"
@@ -277,14 +275,10 @@ class SerialSettings(Settings):
             )
         if self.port is not None and self.usb is not None and self.port != SIMULATED:
             raise setting_error("it has both 'port' and 'usb'", "one of them", at=("usb",), key=True)
-        scheme, is_url, _ = (self.port or "").partition("://")
-        if is_url and not (scheme in _SCHEMES and is_network_port(self.port or "")):
-            known = " or ".join(f"{one}://host:port" for one in _SCHEMES)
-            raise setting_error(
-                f"'{clean(self.port or '')}' is not a port",
-                f"{known}, or a port of this computer",
-                at=("port",),
-            )
+        if "://" in (self.port or "") and not is_network_port(self.port or ""):
+            what = f"'{clean(self.port or '')}' is not a port"
+            expected = "socket://host:port or rfc2217://host:port, or a port of this computer"
+            raise setting_error(what, expected, at=("port",))
         return self
 
     @model_validator(mode="after")
@@ -314,10 +308,7 @@ class SerialSettings(Settings):
             for i, name in enumerate(names):
                 command = self.commands.get(name)
                 if command is None:
-                    meant = closest(name, self.commands)
-                    hint = f"did you mean '{meant}'?" if meant else "declare it below 'commands'"
-                    what = f"there is no command '{clean(name)}'"
-                    raise setting_error(what, known(self.commands), hint, at=(key, i))
+                    raise unknown(f"there is no command '{clean(name)}'", name, self.commands, key, i)
                 if command.arguments:
                     what = f"'{name}' needs {', '.join(command.arguments)}"
                     hint = "declare one with their values in its text"
@@ -331,9 +322,7 @@ class SerialSettings(Settings):
                 at = ("commands", name, "makes", made)
                 value = self.values.get(made)
                 if value is None:
-                    raise setting_error(
-                        f"there is no value '{clean(made)}'", known(self.values), at=at, key=True
-                    )
+                    raise unknown(f"there is no value '{clean(made)}'", made, self.values, *at, key=True)
                 kind, expected = _MADE.get(value.type, (None, "a value of another type"))
                 if type(state) is not kind:
                     raise setting_error(f"the value '{made}' is of type {value.type}", expected, at=at)
@@ -360,9 +349,13 @@ class SerialSettings(Settings):
             yield ("values", name), value.reply, value.reply_with(value.typical)
 
 
-def known(names: Mapping[str, object]) -> str:
-    """The names that the profile declares, for a message."""
-    return one_of(list(names)) if names else "none: the profile declares none"
+def unknown(
+    what: str, name: str, names: Mapping[str, object], *at: str | int, key: bool = False
+) -> PydanticCustomError:
+    """The error for a name that the profile does not declare."""
+    meant = closest(name, names)
+    expected = one_of(list(names)) if names else "none: the profile declares none"
+    return setting_error(what, expected, f"did you mean '{meant}'?" if meant else "", at=at, key=key)
 
 
 def _can_be(text: str, encoding: str) -> bool:

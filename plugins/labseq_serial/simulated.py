@@ -15,8 +15,8 @@ class SimulatedLine:
     """Keeps what commands set, and replies as the instrument would; has the methods of a ``Line``.
 
     A value that has the name of an argument is that argument's last value; a value that a command ``makes``
-    is as the command made it; any other value is that of its example, or plausible. Texts take the time that
-    they take on a line.
+    is as the command made it; any other value is that of its example, or within its limits. Texts take the
+    time that they take on a line.
     """
 
     broken = False

@@ -123,25 +123,26 @@ MAX_TEXT: Final = 200
 """Longest text that is sent as an argument."""
 
 
-class TypedSettings(Settings):
-    """Type, unit and limits of an argument or value."""
+NUMBERS: Final = ("float", "int")
+_KEYS: Final = {
+    "float": {"unit", "min", "max"},
+    "int": {"min", "max"},
+    "bool": {"words"},
+    "text": {"choices"},
+}
+"""Type -> the keys that only some types have."""
 
-    type: Literal["float", "int", "bool", "text"] = Field(default="float", description="what it is")
+
+class LimitedSettings(Settings):
+    """Unit and limits of an argument or value."""
+
     unit: Text | None = Field(
         default=None,
         description="unit of the number on the line; with one that labseq knows, as MHz or degC, it is a "
         "quantity in sequences and results, else, as with mA, the number itself",
     )
-    words: tuple[Text, Text] = Field(
-        default=("0", "1"), description="what false and true are on the line, of a bool"
-    )
     min: Number | None = Field(default=None, description="least that it may be")
     max: Number | None = Field(default=None, description="highest allowed value")
-
-    @property
-    def is_number(self) -> bool:
-        """Whether it is a float or an int."""
-        return self.type in ("float", "int")
 
     @property
     def quantity(self) -> Unit:
@@ -167,25 +168,19 @@ class TypedSettings(Settings):
         """Describe the limits."""
         return format_limits(*self.limits, self.quantity)
 
-    @model_validator(mode="after")
-    def _type_unit_and_limits_fit(self) -> Self:
-        given = self.model_fields_set
-        allowed = {"float": {"unit", "min", "max"}, "int": {"min", "max"}, "bool": {"words"}}
-        for key in ("unit", "min", "max", "words"):
-            if key in given and getattr(self, key) is not None and key not in allowed.get(self.type, ()):
-                kinds = " or ".join(kind for kind, keys in allowed.items() if key in keys)
-                raise setting_error(
-                    f"'{key}' is not for type {self.type}", f"type {kinds}", at=(key,), key=True
-                )
-        if self.words[0] == self.words[1]:
-            raise setting_error(f"false and true are both '{self.words[0]}'", "two words", at=("words",))
+    def check_keys(self, type_name: str) -> None:
+        """Refuse keys that are not for a type, and limits that are none."""
+        others = set[str]().union(*_KEYS.values()) - _KEYS[type_name]
+        for key in sorted(others & self.model_fields_set):
+            types = " or ".join(kind for kind, keys in _KEYS.items() if key in keys)
+            raise setting_error(f"'{key}' is not for type {type_name}", f"type {types}", at=(key,), key=True)
         check_limits(self.unit, self.min, self.max)
-        return self
 
 
-class ArgumentSettings(TypedSettings):
+class ArgumentSettings(LimitedSettings):
     """An argument of a command."""
 
+    type: Literal["float", "int", "text"] = Field(default="float", description="what it is")
     choices: tuple[Text, ...] = Field(default=(), description="what it may be, of a text; none: any text")
 
     def value_of(self, given: object) -> Scalar:
@@ -196,32 +191,24 @@ class ArgumentSettings(TypedSettings):
         """
         if self.type == "float":
             return self.quantity.read(given)
-        if self.type == "bool" and isinstance(given, bool):
-            return given
-        if self.type == "text" and isinstance(given, str) and self._may_be_sent(given):
-            return given
         if self.type == "int" and type(given) in (int, float) and float(str(given)).is_integer():
             return int(float(str(given)))
+        if self.type == "text" and isinstance(given, str) and self._may_be_sent(given):
+            return given
         raise ValueError(f"{given!r} is not accepted; expected {self._expected()}")
 
     def to_line(self, value: Scalar) -> Sent:
         """Convert a value to the argument on the line."""
-        if isinstance(value, bool):
-            return self.words[value]
-        return self.quantity.to_line(value) if self.type == "float" and not isinstance(value, str) else value
+        return self.quantity.to_line(value) if isinstance(value, float) else value
 
     def extremes(self) -> list[tuple[str, Scalar]]:
-        """The limits of a number, with their keys; one value of anything else."""
-        if self.type == "bool":
-            return [("words", False)]
-        if self.type == "text":
-            return [("choices", self.choices[0] if self.choices else "A")]
+        """The limits of a number, with their keys; one value of a text."""
+        if self.type not in NUMBERS:
+            return [("choices", (*self.choices, "A")[0])]
         low, high = self.limits
-        return (
-            [("min", low), ("max", high)]
-            if self.type == "float"
-            else [("min", math.ceil(low)), ("max", math.floor(high))]
-        )
+        if self.type == "int":
+            low, high = math.ceil(low), math.floor(high)
+        return [("min", low), ("max", high)]
 
     def _may_be_sent(self, text: str) -> bool:
         if self.choices:
@@ -229,20 +216,16 @@ class ArgumentSettings(TypedSettings):
         return text.isprintable() and 0 < len(text) <= MAX_TEXT and text == text.strip()
 
     def _expected(self) -> str:
+        if self.type == "int":
+            return "a whole number"
         if self.choices:
             return f"one of {', '.join(self.choices)}"
-        return {
-            "int": "a whole number",
-            "bool": "true or false",
-        }.get(self.type, f"1 to {MAX_TEXT} characters on one line, no space at either end")
+        return f"1 to {MAX_TEXT} characters on one line, no space at either end"
 
     @model_validator(mode="after")
-    def _numbers_have_limits(self) -> Self:
-        if self.choices and self.type != "text":
-            raise setting_error(
-                f"'choices' do not go with type {self.type}", "type text", at=("choices",), key=True
-            )
-        for key in ("min", "max") if self.is_number else ():
+    def _check_type_and_limits(self) -> Self:
+        self.check_keys(self.type)
+        for key in ("min", "max") if self.type in NUMBERS else ():
             if getattr(self, key) is None:
                 raise setting_error(f"'{key}' is missing", "both limits of a number that is sent")
         low, high = self.limits
@@ -331,9 +314,13 @@ class InterlockSettings(Settings):
         return format_limits(*self.limits(quantity), quantity)
 
 
-class ValueSettings(TypedSettings):
+class ValueSettings(LimitedSettings):
     """A value that is read from the instrument."""
 
+    type: Literal["float", "int", "bool", "text"] = Field(default="float", description="what it is")
+    words: tuple[Text, Text] = Field(
+        default=("0", "1"), description="what false and true are on the line, of a bool"
+    )
     ask: Text = Field(description="text that is sent")
     reply: Text = Field(
         default=f"(?P<{VALUE}>.*)",
@@ -390,20 +377,18 @@ class ValueSettings(TypedSettings):
 
     @property
     def typical(self) -> Scalar:
-        """That of the example; without one a value that is plausible and that the interlock allows."""
+        """That of the example; without one the value nearest to 0 on the line that all limits allow."""
         if self.example is not None:
             return self.value_in(self.example)
-        if self.interlock is not None and self.interlock.one_of:
-            return self.interlock.one_of[0]
-        if not self.is_number:
+        lock = self.interlock or InterlockSettings()
+        if lock.one_of:
+            return lock.one_of[0]
+        if self.type not in NUMBERS:
             return False if self.type == "bool" else "0"
-        ranges = [self.limits]
-        if self.interlock is not None:
-            ranges.append(self.interlock.limits(self.quantity))
-        low, high = max(least for least, _ in ranges), min(most for _, most in ranges)
-        ends = [limit for limit in (low, high) if math.isfinite(limit)]
-        middle = sum(ends) / len(ends) if ends else self.quantity.from_line(0.0)
-        return math.floor(middle) if self.type == "int" else middle
+        value = self.quantity.from_line(0.0)
+        for low, high in (self.limits, lock.limits(self.quantity)):
+            value = min(max(value, low), high)
+        return round(value) if self.type == "int" else value
 
     def _read(self, text: str) -> Scalar:
         if self.type == "text":
@@ -429,6 +414,13 @@ class ValueSettings(TypedSettings):
         return str(value)
 
     @model_validator(mode="after")
+    def _check_type_and_words(self) -> Self:
+        self.check_keys(self.type)
+        if self.words[0] == self.words[1]:
+            raise setting_error(f"false and true are both '{self.words[0]}'", "two words", at=("words",))
+        return self
+
+    @model_validator(mode="after")
     def _patterns_are_patterns(self) -> Self:
         for key in ("reply", "error"):
             try:
@@ -449,10 +441,10 @@ class ValueSettings(TypedSettings):
             raise setting_error(
                 "the interlock allows everything", "min, max or one_of", at=("interlock",), key=True
             )
-        wrong = ("one_of",) if self.is_number else ("min", "max")
+        wrong = ("one_of",) if self.type in NUMBERS else ("min", "max")
         for key in wrong:
             if getattr(lock, key) not in (None, ()):
-                expected = "min and max" if self.is_number else "one_of"
+                expected = "min and max" if self.type in NUMBERS else "one_of"
                 what = f"'{key}' is not for a value of type {self.type}"
                 raise setting_error(what, expected, at=("interlock", key), key=True)
         kind = bool if self.type == "bool" else str

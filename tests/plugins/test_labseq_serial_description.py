@@ -86,8 +86,8 @@ a:
         (", max: 200 MHz", "", "12:12: 'max' is missing; expected both limits of a number that is sent"),
         ("unit: MHz", "unit: Mhz", "12:19: labseq knows no unit 'Mhz'; expected another one; did you mean"),
         ("min: 0, max: 15", "min: 0.2, max: 0.7", "13:29: there is no whole number within the limits"),
-        ("type: int, min: 0, max: 15", "type: bool, max: 3", "13:25: 'max' is not for type bool; exp"),
-        ("choices: [SIN, SQU]", "words: [a, b]", "14:28: 'words' is not for type text; expected type"),
+        ("type: int, min: 0, max: 15", "type: text, max: 3", "13:25: 'max' is not for type text; exp"),
+        ("words: [OFF, ON]", "max: 3", "16:38: 'max' is not for type bool; expected type float or int"),
         ("        n:", "        name:", "an argument is called 'name'; expected a word of letters"),
         # replies and effects
         ("reply: OK", "reply: '(OK'", "8:31: '(OK' is not a regular expression: missing ), unterminated"),
@@ -205,22 +205,22 @@ def test_a_dry_run_holds_every_kind_of_argument_against_its_value() -> None:
       arguments:
         level: {unit: mV, min: 0 V, max: 1 V}
         n: {type: int, min: 0, max: 9}
-        on: {type: bool, words: [OFF, ON]}
+        on: {type: text, choices: [OFF, ON]}
         wave: {type: text}
   values:
     level: {ask: "LEVEL?", unit: mV, reply: "(?P<value>[0-9]+[.][0-9]{2}) mV", example: "10.00 mV"}
     n: {ask: "N?", type: int, reply: "N=(?P<value>[0-9])"}
-    on: {ask: "ON?", type: bool, words: [OFF, ON]}
+    on: {ask: "ON?", type: text}
     wave: {ask: "WAVE?", type: text}
 """
     device = SerialDevice(settings(text), Context("source", clock=FakeClock()))
     device.open()
-    device.command("set", level="125 mV", n=7.0, on=True, wave="SIN")
+    device.command("set", level="125 mV", n=7.0, on="ON", wave="SIN")
     read = {name: device.read(name) for name in ("level", "n", "on", "wave")}
-    assert read == {"level": 0.125, "n": 7, "on": True, "wave": "SIN"}
+    assert read == {"level": 0.125, "n": 7, "on": "ON", "wave": "SIN"}
     for text in ("ü", "A\nOUT ON", " A", "", "x" * 201):
         with pytest.raises(DeviceError, match="expected"):
-            device.command("set", level=0, n=1, on=False, wave=text)
+            device.command("set", level=0, n=1, on="OFF", wave=text)
     assert device.read("wave") == "SIN"
 
 
