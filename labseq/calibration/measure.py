@@ -30,7 +30,7 @@ from labseq.calibration.thresholds import analyse_thresholds
 from labseq.calibration_store import Store, Stored, grid_text
 from labseq.config.addresses import Override, split_overrides
 from labseq.config.profile import OFF, ProfileSpec, load_profile
-from labseq.console.runs import existing_run
+from labseq.console.runs import folder_of_run
 from labseq.data import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.messages import clean, install_hint
@@ -214,7 +214,7 @@ def _open(source: Path, request: CalibrationRequest, hardware: ResolvedProfile) 
         ConfigError: It is not a run, or has other sites or devices.
     """
     try:
-        run = open_run(existing_run(source))
+        run = open_run(folder_of_run(source))
     except RecordingError as error:
         raise ConfigError(Problem(str(error), "--from")) from error
     if run.target.shape != hardware.grid.shape:

@@ -12,7 +12,7 @@ from labseq.analysis.campaigns import campaign_in, export_campaign
 from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.console.output import say
 from labseq.console.report import Column, print_report, table
-from labseq.console.runs import chosen_run, existing_run
+from labseq.console.runs import chosen_run, folder_of_run
 from labseq.console.text import plural
 from labseq.data import Run
 from labseq.data.export import ENDINGS, check_export, export_run, files_of, write_columns
@@ -37,7 +37,7 @@ def examine(data: Path | None, *, dry_run: bool, as_json: bool) -> int:
         if data is None:
             hint = "give a data folder or a run, or set LABSEQ_DATA"
             raise ConfigError(Problem("there is no such folder", visible(str(root)), hint=hint))
-        root = existing_run(data)
+        root = folder_of_run(data)
     report = find_damage(root, dry_run=dry_run)
     examined = Examination(
         root, dry_run, report.n_runs, report.n_shots, tuple(report.in_progress), tuple(report.findings)

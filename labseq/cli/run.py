@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from labseq.assembly.options import Options
 from labseq.console.events import LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
-from labseq.console.runs import existing_run
+from labseq.console.runs import folder_of_run
 from labseq.console.text import plural, quoted
 from labseq.data import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
@@ -49,7 +49,7 @@ def resume_run(path: Path, options: Mapping[str, Any], *, as_json: bool) -> None
     """Resume a run that ended early, and print the result; the options are those of ``Session.resume``."""
 
     def resume(observer: RunObserver | None) -> Session:
-        return Session.resume(existing_run(path), **options, observer=observer)
+        return Session.resume(folder_of_run(path), **options, observer=observer)
 
     run_session(resume, as_json=as_json)
 
@@ -130,7 +130,7 @@ def stop_run(run: Path | None, profile: str | None, *, queue: bool, wait: bool) 
         say("the queue starts no further runs")
         if run is None and not running_here(profile):
             return
-    folder = find_running(None if run is None else existing_run(run), profile)
+    folder = find_running(None if run is None else folder_of_run(run), profile)
     ask_to_stop(folder)
     say(f"{folder} ({owner_text(folder)}) ends after its current shot")
     say(f"resume it later with: labseq resume {quoted(folder)}")

@@ -277,5 +277,5 @@ def _wall_time(time_s: float) -> str:
 
 def _wall_time_s(run: Run) -> float:
     ends = {"shot_finished", "shot_repeated"}
-    times_s = [event.t_s for event in Follower(run.path).events() if event.name in ends]
+    times_s = [event.t_s for event in Follower(run.path).log() if event.name in ends]
     return max(times_s, default=math.nan)

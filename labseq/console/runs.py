@@ -13,24 +13,29 @@ from labseq.recording.folders import RUN_FILE, counter_of, find_run, runs_in
 
 
 def chosen_run(path: Path | None) -> Run:
-    """Open the run of this folder or of any file in it; without a path the newest.
+    """Open the run that a command is given; see :func:`folder_of_run`.
 
     Raises:
         ConfigError: There is no such run.
         RecordingError: It is damaged.
     """
-    return open_run(newest_run(data_root()) if path is None else existing_run(path))
+    return open_run(folder_of_run(path))
 
 
-def existing_run(path: Path) -> Path:
-    """The folder of the run that a command is given: its folder, any file in it, its name or its number.
+def folder_of_run(path: Path | None) -> Path:
+    """The folder of the run that a command is given.
+
+    Args:
+        path: Its folder, any file in it, its name or its number; None for the newest run.
 
     Raises:
         ConfigError: There is no such run: the command line is wrong, not the data.
     """
+    if path is None:
+        return newest_run(data_root())
     try:
         if not is_there(path.expanduser()):
-            return named_run(path.as_posix(), data_root())
+            return _named_run(path.as_posix(), data_root())
         return find_run(path)
     except RecordingError as error:
         raise ConfigError(str(error)) from error
@@ -39,7 +44,7 @@ def existing_run(path: Path) -> Path:
         raise ConfigError(Problem(f"the folder cannot be read: {reason}", clean(str(path)))) from error
 
 
-def named_run(name: str, root: Path) -> Path:
+def _named_run(name: str, root: Path) -> Path:
     """The newest run of a name or number as `labseq runs` prints it, all of it or a part.
 
     Args:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
-from dataclasses import dataclass
+import time
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from labseq.data.shot import Shot, caching_loader
+from labseq.errors import RecordingError
 from labseq.files import NewLines
 from labseq.model.records import RunStatus
 from labseq.recording.folders import EVENTS_FILE, INDEX_FILE
 from labseq.recording.index import IndexRow, row_of_line
-from labseq.recording.run_file import read_state
+from labseq.recording.run_file import read_record, read_state
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A line of a run's event log.
+    """Something that happened in a run.
 
     Attributes:
         t_utc: Wall time, ISO 8601, UTC.
@@ -38,14 +42,18 @@ class Follower:
 
     Args:
         run_dir: The run's folder.
+        clock: Clock of this computer in seconds.
     """
 
-    def __init__(self, run_dir: Path) -> None:
+    def __init__(self, run_dir: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self._run_dir = run_dir
+        self._clock = clock
         self._index = NewLines(run_dir / INDEX_FILE)
         self._log = NewLines(run_dir / EVENTS_FILE)
         self._load = caching_loader()
-        self._time_s = self._last_s = 0.0
+        self._taken = defaultdict[tuple[int, int, str], list[Shot]](list)
+        self._logged_s = self._line_s = 0.0
+        self._event_s, self._told_s = 0.0, clock()
 
     @property
     def is_over(self) -> bool:
@@ -55,6 +63,10 @@ class Follower:
     def state(self) -> tuple[RunStatus, str]:
         """Status of the run, and the error that ended it."""
         return read_state(self._run_dir)
+
+    def now(self) -> float:
+        """Time of the run in seconds, which goes on from that of the last of :meth:`events`."""
+        return self._event_s + self._clock() - self._told_s
 
     def is_replaced(self) -> bool:
         """Whether the index was replaced, as `labseq doctor` does: a new follower is needed."""
@@ -81,7 +93,7 @@ class Follower:
         """The shot of a row of the index."""
         return Shot(self._run_dir, row, self._load)
 
-    def events(self) -> Generator[Event]:
+    def log(self) -> Generator[Event]:
         """The new lines of the event log, without damaged ones.
 
         Raises:
@@ -91,10 +103,58 @@ class Follower:
             self._advance(line.get("t_s"))
             name, values = line.get("event"), line.get("values")
             if isinstance(name, str) and isinstance(values, dict):
-                yield Event(str(line.get("t_utc", "")), self._time_s, name, values)
+                yield Event(str(line.get("t_utc", "")), self._logged_s, name, values)
+
+    def events(self) -> Generator[Event]:
+        """What the run's own observer was told since the last call, from the log, the index and shot files.
+
+        Raises:
+            RecordingError: The run can no longer be read.
+        """
+        logged = list(self.log())
+        # after the log: a shot is in the index before its event is in the log
+        for shot in self.shots():
+            self._taken[shot.index, shot.attempt, shot.status].append(shot)
+        shots = [self._shot_ended_by(event) for event in logged]
+        # reading a shot's file takes 10 ms: of a run that is joined late, only the last ones are opened
+        to_open = {id(shot) for shot in list(filter(None, shots))[-20:]}
+        for event, shot in zip(logged, shots, strict=True):
+            self._event_s, self._told_s = event.t_s, self._clock()
+            if shot is not None and id(shot) in to_open:
+                yield from _inside(shot, event)
+            yield replace(event, values={**event.values, **self._unlogged(event, shot)})
+
+    def _unlogged(self, event: Event, shot: Shot | None) -> dict[str, Any]:
+        """The values of an event that the log leaves out, as run.json and the index hold them."""
+        if event.name == "run_starting":
+            return {"record": read_record(self._run_dir)}
+        return {} if shot is None else {"row": shot.row}
+
+    def _shot_ended_by(self, event: Event) -> Shot | None:
+        """The attempt that an event ends; None for other events and damaged lines."""
+        if event.name not in ("shot_finished", "shot_repeated"):
+            return None
+        try:
+            shot = event.values["shot"]
+            # an attempt that was interrupted is made again, under the same number, when the run is resumed
+            return self._taken[shot["shot_index"], shot["attempt"], shot["status"]].pop(0)
+        except (KeyError, TypeError, IndexError):
+            return None
 
     def _advance(self, t_s: Any) -> None:
         """Advance to the time of a line; each part of a resumed run begins at 0."""
         if type(t_s) in (int, float) and 0 <= t_s < 1e12:  # a damaged line must not move the time
-            self._time_s += t_s - self._last_s if t_s >= self._last_s else t_s
-            self._last_s = t_s
+            self._logged_s += t_s - self._line_s if t_s >= self._line_s else t_s
+            self._line_s = t_s
+
+
+def _inside(shot: Shot, end: Event) -> Iterator[Event]:
+    """The stages of a shot and its last image, at the time of its end; none if its file cannot be read."""
+    with suppress(RecordingError):
+        for timing in shot.timing:
+            yield replace(end, name="stage", values={"timing": timing})
+        for image in shot.images[-1:]:
+            # the log has this event already; it says here whose image follows
+            yield replace(end, name="shot_started", values={"shot": shot.index, "attempt": shot.attempt})
+            values = {"image": image, "filling_fraction": shot.filling_fraction}
+            yield replace(end, name="image", values=values)

@@ -100,7 +100,7 @@ class OpenRun:
         Raises:
             RecordingError: It cannot be read.
         """
-        for event in self.follower.events():
+        for event in self.follower.log():
             with suppress(TypeError, ValueError):  # a damaged line
                 self._add_event(event)
 

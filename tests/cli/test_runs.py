@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from labseq.console.runs import existing_run
+from labseq.console.runs import folder_of_run
 from labseq.recording import RunWriter
 
 DAYS = ("2026-01-02", "2026-01-03")
@@ -76,7 +76,7 @@ def test_the_runs_of_a_folder(data: Path, call: Any) -> None:
     ],
 )
 def test_a_run_is_found_by_its_name_or_number(name: str, folder: str, data: Path) -> None:
-    assert existing_run(Path(name)).resolve() == (data / folder).resolve()
+    assert folder_of_run(Path(name)).resolve() == (data / folder).resolve()
 
 
 def test_a_name_of_no_run(data: Path, call: Any) -> None:

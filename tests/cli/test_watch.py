@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from labseq.cli.live import Tally
-from labseq.cli.watch import WatchedRun, watch_run
+from labseq.cli.watch import watch_run
 from labseq.data import open_run
+from labseq.data.follower import Follower
 from labseq.recording import RunWriter
 
 
@@ -100,15 +101,17 @@ def test_the_view_learns_what_the_runs_own_view_does(watched: WrittenRun) -> Non
     times_s, path = iter([0.0, 70.0, 5.0]), watched.writer.run_dir / "events.jsonl"  # resumed before the last
     lines = [json.loads(line) | {"t_s": next(times_s)} for line in path.read_text("utf-8").splitlines()]
     path.write_text("".join(f"{json.dumps(line)}\n" for line in lines), "utf-8")
-    clock_s = iter([500.0, 500.0, 507.0])
-    reader = WatchedRun(watched.writer.run_dir, lambda: next(clock_s))
-    tally = Tally(reader.now)
-    for name, values in reader.events():
-        tally.add(name, values)
+    clock_s = [500.0]
+    follower = Follower(watched.writer.run_dir, lambda: clock_s[0])
+    tally = Tally(follower.now)
+    for event in follower.events():
+        tally.add(event.name, event.values)
     assert (tally.n_done, tally.n_defect_free, tally.n_seen, tally.n_shots) == (1, 1, 1, 3)
-    assert (reader.now(), reader.now()) == (75.0, 82.0)  # of the last event, and 7 s later
-    assert not reader.follower.is_over
-    assert [*reader.events()] == []
+    assert follower.now() == 75.0
+    clock_s[0] = 507.0
+    assert follower.now() == 82.0
+    assert not follower.is_over
+    assert [*follower.events()] == []
 
 
 def test_lines_of_another_version_and_damaged_ones_are_passed_over(watched: WrittenRun) -> None:

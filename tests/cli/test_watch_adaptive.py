@@ -12,9 +12,9 @@ import labseq
 from labseq.analysis.scanned import ScanRequest
 from labseq.cli.live import Picture, Tally, draw_scan
 from labseq.cli.show import Tables, show_run
-from labseq.cli.watch import WatchedRun
 from labseq.console.arrays import UNICODE
 from labseq.console.events import LogLines, event_text
+from labseq.data.follower import Follower
 from labseq.data.points import scan_points
 from tests.session.small_runs import PROFILE
 
@@ -93,11 +93,11 @@ def test_the_run_ends_with_the_best_point_and_a_suggested_one(
 def test_a_view_in_another_process_learns_the_points_and_the_best(
     printed: tuple[labseq.Run, list[str]],
 ) -> None:
-    watched = WatchedRun(printed[0].path)
+    watched = Follower(printed[0].path)
     tally, lines = Tally(watched.now), list[str]()
-    for name, values in watched.events():
-        tally.add(name, values)
-        lines.append(event_text(name, values, tally.record))
+    for event in watched.events():
+        tally.add(event.name, event.values)
+        lines.append(event_text(event.name, event.values, tally.record))
     assert [line for line in lines if line.startswith("point ")] == [
         line for line in printed[1] if line.startswith("point ")
     ]

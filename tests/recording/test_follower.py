@@ -56,14 +56,14 @@ def test_times_of_events_are_those_of_the_run_in_all_its_parts(writer: RunWriter
     log = writer.run_dir / "events.jsonl"
     log.write_text("x\n" + "".join(f"{json.dumps(line)}\n" for line in lines), "utf-8")
     follower = Follower(writer.run_dir)
-    events = list(follower.events())
+    events = list(follower.log())
     assert [(event.name, event.t_s) for event in events] == [
         ("run_starting", 2.0),
         ("warning", 70.0),
         ("run_starting", 75.0),
     ]
     assert events[-1].t_utc.startswith("2026-11-20")
-    assert list(follower.events()) == []
+    assert list(follower.log()) == []
 
 
 def test_only_whole_lines_are_read_and_each_once(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import labseq
 from labseq.analysis.timing import writing_s
 from labseq.cli.live import Tally
 from labseq.cli.summary import Summary
-from labseq.cli.watch import WatchedRun
+from labseq.data.follower import Follower
 from labseq.errors import RecordingError
 from labseq.model import RunRecord
 from labseq.plain import to_plain
@@ -145,10 +145,10 @@ def test_a_clock_that_is_set_changes_nothing_but_time_stamps(
     assert shown == expected
     (wall_time,) = (line for line in Summary.of(run).as_text() if line.startswith("wall time "))
     assert re.fullmatch(r"wall time +[\d.]+ m?s on the computer's clock", wall_time)
-    watched = WatchedRun(run.path)
+    watched = Follower(run.path)
     tally = Tally(watched.now)
-    for name, values in watched.events():
-        tally.add(name, values)
+    for event in watched.events():
+        tally.add(event.name, event.values)
     assert (tally.n_before, tally.n_done) == (0, len(run.shots))
     assert 0 <= watched.now() < DAY_S / 2
 
