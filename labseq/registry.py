@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import re
 from collections.abc import Callable, Generator, Mapping
@@ -11,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.errors import PluginLoadError, UnknownPluginError
+from labseq.errors import PluginLoadError
 from labseq.roles.table import ROLES, Role
 
 VIRTUAL_TWIN: Final = "virtual"
@@ -173,22 +172,6 @@ class Registry:
             _check(entry)
         self._entries[kind, name] = entry
 
-    def _imported(self, key: tuple[str, str]) -> Entry:
-        """The entry, after importing whatever it gives only by its place."""
-        entry = self._entries[key]
-        if entry.is_place:
-            parts = (entry.factory, entry.settings_model, entry.simulated)
-            work = f"the import of {entry.kind} '{entry.name}'"
-            factory, model, simulated = self._call(entry.owner, work, lambda: [*map(_import_place, parts)])
-            simulated = simulated() if callable(simulated) else simulated
-            reason, simulated = (simulated, None) if isinstance(simulated, str) else ("", simulated)
-            entry = replace(
-                entry, factory=factory, settings_model=model, simulated=simulated, no_simulator=reason
-            )
-            _check(entry)
-            self._entries[key] = entry
-        return entry
-
     def forget(self, origin: str) -> None:
         """Remove all that a plugin offers."""
         for key in self.offers(origin):
@@ -252,22 +235,26 @@ class Registry:
         """Offer a timing box that switches lines. Options as for :meth:`camera`."""
         self._add("lines", name, factory, settings_model, **options)
 
-    def get(self, kind: str, name: str) -> Entry:
-        """Find an entry.
+    def find(self, kind: str, name: str) -> Entry | None:
+        """Find an entry, and import whatever it gives only by its place; None if there is no such entry.
 
         Raises:
-            UnknownPluginError: Nothing of that kind has this name.
+            PluginLoadError: It cannot be imported.
         """
-        if (kind, name) not in self._entries:
-            known = self.names(kind)
-            close = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean '{close[0]}'?" if close else ""
-            raise UnknownPluginError(kind, name, known, hint)
-        return self._imported((kind, name))
-
-    def find(self, kind: str, name: str) -> Entry | None:
-        """Find an entry, or None."""
-        return self._imported((kind, name)) if (kind, name) in self._entries else None
+        entry = self._entries.get((kind, name))
+        if entry is None or not entry.is_place:
+            return entry
+        parts = (entry.factory, entry.settings_model, entry.simulated)
+        work = f"the import of {kind} '{name}'"
+        factory, model, simulated = self._call(entry.owner, work, lambda: [*map(_import_place, parts)])
+        simulated = simulated() if callable(simulated) else simulated
+        reason, simulated = (simulated, None) if isinstance(simulated, str) else ("", simulated)
+        entry = replace(
+            entry, factory=factory, settings_model=model, simulated=simulated, no_simulator=reason
+        )
+        _check(entry)
+        self._entries[kind, name] = entry
+        return entry
 
     def names(self, kind: str) -> list[str]:
         """Names of all entries of a kind, sorted."""
@@ -281,7 +268,7 @@ class Registry:
 
     def entries(self, origin: str | None = None) -> list[Entry]:
         """All entries, or those of one plugin, by kind and name."""
-        return [self._imported(key) for key in self.offers(origin)]
+        return [entry for key in self.offers(origin) if (entry := self.find(*key)) is not None]
 
 
 def _import_place(value: Any) -> Any:

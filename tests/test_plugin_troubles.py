@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.assembly.plugin_choice import ChosenPlugin, construct_one, construct_target, validate
+from labseq.assembly.plugin_choice import ChosenPlugin, construct_one, construct_target, read_settings
 from labseq.cli import main
 from labseq.cli.devices import Plugins
 from labseq.config.document import Document
@@ -253,7 +253,7 @@ def test_a_settings_model_that_fails_is_named(code: str, message: str, tmp_path:
     assert info.state == "loaded", info.reason
     document = Document.parse("planner: {use: mine, size: 3}\n", "s.yaml")
     with pytest.raises(LabseqError) as caught:
-        validate(document, impatient(host), ("planner",), frozenset({"use"}))
+        read_settings(document, impatient(host), ("planner",), frozenset({"use"}))
     assert message in str(caught.value)
     assert str(caught.value).startswith("s.yaml:1:")
 

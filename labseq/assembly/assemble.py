@@ -16,8 +16,8 @@ from labseq.assembly.plugin_choice import (
     construct_target,
     dump,
     load_plugins,
+    read_settings,
     resolve,
-    validate,
 )
 from labseq.assembly.points import Point, ScanPoints, make_step, place_note
 from labseq.assembly.policies import make_policy, with_policies
@@ -287,7 +287,7 @@ def _check_alone(document: Document, sequence: SequenceSpec, problems: ProblemCo
             entry = host.registry.find("step", spec.kind)
             if entry is not None:
                 with problems:
-                    validate(document, entry, spec.loc)
+                    read_settings(document, entry, spec.loc)
 
 
 def _expressions(sequence: Document, profile: Document) -> dict[str, str]:

@@ -25,8 +25,8 @@ from labseq.errors import (
 from labseq.messages import clean
 from labseq.model import ScanSpace, SiteGrid, TargetPattern
 from labseq.plugins import PluginHost, call_plugin
-from labseq.registry import LOAD_S, VIRTUAL_TWIN, Entry
-from labseq.roles import ROLES, Context
+from labseq.registry import LOAD_S, Entry
+from labseq.roles import Context
 from labseq.settings import Choice, NoSettings, Settings
 
 DryRun = Literal["off", "full", "fast"]
@@ -90,9 +90,9 @@ def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> 
         ConfigError: Unknown name, a plugin that failed to load, or wrong settings, with file, line
             and column.
     """
-    entry = named(host, document, kind, choice.use, (*choice.loc, choice.key))
+    entry = find_entry(host, document, kind, choice.use, (*choice.loc, choice.key))
     try:
-        settings = validate(document, entry, choice.loc, choice.core_keys)
+        settings = read_settings(document, entry, choice.loc, choice.core_keys)
     except ConfigError as error:
         raise _with_advice(error, document, choice) from None
     return ChosenPlugin(entry, settings, document, choice.loc)
@@ -113,7 +113,7 @@ def _with_advice(error: ConfigError, document: Document, choice: Choice) -> Conf
     )
 
 
-def named(
+def find_entry(
     host: PluginHost, document: Document, kind: str, name: str, loc: Loc, *, key: bool = False
 ) -> Entry:
     """Find the registry entry of a plugin named in a file.
@@ -133,10 +133,10 @@ def named(
         raise document.error(loc, str(error), key=key) from None
 
 
-def validate(
+def read_settings(
     document: Document, entry: Entry, loc: tuple[str | int, ...], drop: frozenset[str] = frozenset()
 ) -> Settings | None:
-    """Validate the settings of an entry; None if it takes none.
+    """The settings of an entry, validated; None if it takes none.
 
     Raises:
         ConfigError: They are invalid, or the plugin's own validators fail; with their place.
@@ -154,54 +154,6 @@ def validate(
     except PluginLoadError as error:
         raise document.error(loc, str(error)) from error
     return None if entry.settings_model is None else settings
-
-
-def choose(
-    host: PluginHost,
-    document: Document,
-    kind: str,
-    choice: Choice,
-    dry_run: DryRun = "off",
-) -> tuple[ChosenPlugin, str]:
-    """Choose the plugin of a role; in a dry run its simulator, or its virtual twin.
-
-    Returns:
-        The choice, and a warning for the user or "".
-    """
-    if dry_run == "off" or not ROLES[kind].has_twin or choice.use == VIRTUAL_TWIN:
-        return resolve(host, document, kind, choice), ""
-    entry = host.registry.get(kind, VIRTUAL_TWIN)
-    twin = ChosenPlugin(entry, _defaults(entry), document, choice.loc)
-    if kind == "simulation":  # one at another computer has an identity, as hardware has
-        chosen = resolve(host, document, kind, choice)
-        elsewhere = chosen.settings is not None and chosen.settings.identities()
-        return (twin if elsewhere else chosen), ""
-    if dry_run == "fast":
-        return twin, ""
-    if absence := _absence(host, kind, choice.use):
-        return twin, f"{absence}; its virtual twin takes its place and its settings were not checked"
-    chosen = resolve(host, document, kind, choice)
-    if chosen.entry.virtual_time:
-        return chosen, ""
-    if chosen.entry.simulated is not None and chosen.settings is not None:
-        settings = chosen.settings.model_copy(update=dict(chosen.entry.simulated))
-        return replace(chosen, settings=settings), ""
-    reason = chosen.entry.no_simulator
-    return twin, f"{reason}; its virtual twin takes its place" if reason else ""
-
-
-def _absence(host: PluginHost, kind: str, name: str) -> str:
-    """The reason why no plugin offers a name (it failed to load, or does not exist); "" if one does."""
-    if host.registry.find(kind, name) is not None:
-        return ""
-    try:
-        host.get(kind, name)
-    except PluginLoadError as error:
-        return str(error)
-    except UnknownPluginError as error:
-        hint = f" ({error.hint})" if error.hint else ""
-        return f"plugin '{clean(name)}' is not installed{hint}"
-    return ""
 
 
 def check_dry_run(dry_run: object) -> None:
@@ -231,10 +183,6 @@ def dump(entry: Entry, settings: Settings | None) -> dict[str, Any]:
 def changed_settings(settings: Settings | None) -> dict[str, Any]:
     """The settings that differ from the defaults, SI, JSON-ready."""
     return {} if settings is None else settings.model_dump(mode="json", exclude_defaults=True)
-
-
-def _defaults(entry: Entry) -> Settings | None:
-    return entry.settings_model() if entry.settings_model is not None else None
 
 
 def load_plugins(folders: Sequence[Path] = (), max_wait_s: float = LOAD_S) -> PluginHost:

@@ -13,7 +13,14 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
-from labseq.assembly.plugin_choice import ChosenPlugin, construct_role, dump, named, resolve, validate
+from labseq.assembly.plugin_choice import (
+    ChosenPlugin,
+    construct_role,
+    dump,
+    find_entry,
+    read_settings,
+    resolve,
+)
 from labseq.config.addresses import PROFILE, PROFILE_ROLES, VARIABLES
 from labseq.config.scan import Axis, Scan, put
 from labseq.errors import ConfigError, Loc, PluginLoadError, ProblemCollector, one_of
@@ -265,7 +272,7 @@ def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> 
         ConfigError: The step is unknown, its settings are invalid, or the profile lacks the device that it
             names; with their place.
     """
-    entry = named(hardware.host, document, "step", spec.kind, spec.loc, key=True)
+    entry = find_entry(hardware.host, document, "step", spec.kind, spec.loc, key=True)
     for key in {"name", "policy"} - {setting.key for setting in settings_of(entry.settings_model)}:
         if document.root.at((*spec.loc, key)) is not None:
             what, hint = (
@@ -273,7 +280,7 @@ def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> 
                 f"write '{key}' on a line of its own below",
             )
             raise document.error((*spec.loc, key), what, f"'{key}' beside '{spec.kind}'", hint, key=True)
-    settings = validate(document, entry, spec.loc)
+    settings = read_settings(document, entry, spec.loc)
     try:
         step, dumped = construct_role(entry, settings), dump(entry, settings)
     except (ConfigError, PluginLoadError) as error:

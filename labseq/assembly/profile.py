@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from labseq.assembly.calibrations import ActiveCalibrations, calibrated, with_calibrations
-from labseq.assembly.plugin_choice import ChosenPlugin, DryRun, choose, load_plugins
+from labseq.assembly.plugin_choice import ChosenPlugin, DryRun, load_plugins, resolve
 from labseq.config.addresses import Override
 from labseq.config.document import Document, plugin_paths
 from labseq.config.profile import DeviceChoice, MobileTweezersChoice, ProfileSpec, load_profile
 from labseq.config.scan import Scan
 from labseq.errors import (
     ConfigError,
+    PluginLoadError,
     ProblemCollector,
+    UnknownPluginError,
     collecting,
     one_of,
 )
@@ -105,12 +107,12 @@ class ResolvedProfile:
                 continue
             with problems:
                 own = document.validate(type(choice), loc).placed(*loc)
-                kind = kind_of(role, own)
-                if ROLES[kind].is_hardware and own.use != choice.use:
+                is_hardware = chosen[role].entry.role.is_hardware
+                if is_hardware and own.use != choice.use:
                     what = f"a scan cannot change the driver of {role}"
                     raise document.error((*loc, "use"), what, "one driver for the whole run")
-                one, _ = choose_role(self.host, document, profile, role, own, self.dry_run)
-                if ROLES[kind].is_hardware and one.virtual_time != chosen[role].virtual_time:
+                one, _ = choose(self.host, document, profile, role, own, self.dry_run)
+                if is_hardware and one.virtual_time != chosen[role].virtual_time:
                     what = f"the scan would change whether {role} is simulated"
                     raise document.error(loc, what, "all points simulated, or none")
                 chosen[role] = one
@@ -142,7 +144,8 @@ def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, problem
     """Find lines that are on during unknown steps."""
     if spec.lines is None:
         return
-    steps = [name for name in host.registry.names("step") if _takes_time(host, name)]
+    entries = [host.registry.find("step", name) for name in host.registry.names("step")]
+    steps = [entry.name for entry in entries if entry and getattr(entry.factory, "takes_time", True)]
     known = [IDLE, *steps]
     for name, channel in spec.lines.channels.items():
         for place, kind in enumerate(channel.on):
@@ -152,10 +155,6 @@ def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, problem
                 problems.add(
                     document.error(loc, f"there is no kind of step '{clean(kind)}'", one_of(known), hint)
                 )
-
-
-def _takes_time(host: PluginHost, step: str) -> bool:
-    return bool(getattr(host.registry.get("step", step).factory, "takes_time", True))
 
 
 def check_dead_time(document: Document, spec: ProfileSpec, problems: ProblemCollector) -> None:
@@ -230,7 +229,7 @@ def choose_plugins(
             refused[role] = ConfigError("its settings in the profile are invalid")
             continue
         try:
-            chosen[role], warning = choose_role(host, document, spec, role, choice, dry_run)
+            chosen[role], warning = choose(host, document, spec, role, choice, dry_run)
             warnings += [f"{role}: {warning}"] if warning else []
         except ConfigError as error:
             refused[role] = error
@@ -249,16 +248,57 @@ def choose_plugins(
     )
 
 
-def kind_of(role: str, choice: Choice) -> str:
-    """The kind of plugin that a role or a device of the profile needs."""
-    return choice.role if isinstance(choice, DeviceChoice) else role
-
-
-def choose_role(
+def choose(
     host: PluginHost, document: Document, spec: ProfileSpec, role: str, choice: Choice, dry_run: DryRun
 ) -> tuple[ChosenPlugin, str]:
-    """The plugin of a role or device, and a warning for the user or ""."""
-    kind = kind_of(role, choice)
-    chosen, warning = choose(host, document, kind, choice, dry_run)
+    """The plugin of a role or device of a profile, and a warning for the user or "".
+
+    Raises:
+        ConfigError: Unknown name, a plugin that failed to load, or wrong settings, with their place.
+    """
+    kind = choice.role if isinstance(choice, DeviceChoice) else role
     by_line = kind == role and trigger_line(spec.line_specs, role) is not None
+    if dry_run == "off" or not ROLES[kind].has_twin or choice.use == VIRTUAL_TWIN:
+        chosen, warning = resolve(host, document, kind, choice), ""
+    else:
+        chosen, warning = _in_dry_run(host, document, kind, choice, dry_run)
     return replace(chosen, by_line=by_line), warning
+
+
+def _in_dry_run(
+    host: PluginHost, document: Document, kind: str, choice: Choice, dry_run: DryRun
+) -> tuple[ChosenPlugin, str]:
+    """The plugin with its simulated device, else its virtual twin; and a warning for the user or ""."""
+    entry = host.get(kind, VIRTUAL_TWIN)
+    defaults = None if entry.settings_model is None else entry.settings_model()
+    twin = ChosenPlugin(entry, defaults, document, choice.loc)
+    if kind == "simulation":  # one at another computer has an identity, as hardware has
+        chosen = resolve(host, document, kind, choice)
+        elsewhere = chosen.settings is not None and chosen.settings.identities()
+        return (twin if elsewhere else chosen), ""
+    if dry_run == "fast":
+        return twin, ""
+    if absence := _absence(host, kind, choice.use):
+        return twin, f"{absence}; its virtual twin takes its place and its settings were not checked"
+    chosen = resolve(host, document, kind, choice)
+    if chosen.entry.virtual_time:
+        return chosen, ""
+    if chosen.entry.simulated is not None and chosen.settings is not None:
+        settings = chosen.settings.model_copy(update=dict(chosen.entry.simulated))
+        return replace(chosen, settings=settings), ""
+    reason = chosen.entry.no_simulator
+    return twin, f"{reason}; its virtual twin takes its place" if reason else ""
+
+
+def _absence(host: PluginHost, kind: str, name: str) -> str:
+    """The reason why no plugin offers a name (it failed to load, or does not exist); "" if one does."""
+    if host.registry.find(kind, name) is not None:
+        return ""
+    try:
+        host.get(kind, name)
+    except PluginLoadError as error:
+        return str(error)
+    except UnknownPluginError as error:
+        hint = f" ({error.hint})" if error.hint else ""
+        return f"plugin '{clean(name)}' is not installed{hint}"
+    return ""

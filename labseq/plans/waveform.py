@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from labseq.assembly.occupancies import read_source
 from labseq.assembly.planning import PlannedMoves, PlanRequest, plan_moves
-from labseq.assembly.plugin_choice import choose, load_plugins
+from labseq.assembly.plugin_choice import load_plugins
+from labseq.assembly.profile import choose
 from labseq.config.addresses import split_overrides
 from labseq.config.document import plugin_paths
 from labseq.config.profile import load_profile
@@ -114,7 +115,7 @@ def _of_profile(profile: str, overrides: Sequence[str]) -> SampleRate:
     _, for_profile = split_overrides(overrides)
     document, spec = load_profile(profile, beside=Path(), overrides=for_profile)
     host = load_plugins(plugin_paths(document, spec.plugin_folders), max_wait_s=spec.timeouts.load_s)
-    chosen, warning = choose(host, document, "mobile_tweezers", spec.mobile_tweezers, "full")
+    chosen, warning = choose(host, document, spec, "mobile_tweezers", spec.mobile_tweezers, "full")
     rate_hz = getattr(chosen.settings, "sample_rate", None)
     warning = f"mobile_tweezers: {warning}" if warning else ""
     if isinstance(rate_hz, int | float):

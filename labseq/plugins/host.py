@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib.metadata
 import inspect
 import os
@@ -18,7 +19,7 @@ from typing import Any, Final, Literal, cast
 import pluggy
 
 from labseq import __version__, hookspecs
-from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError, one_of
+from labseq.errors import ConfigError, LabseqError, PluginLoadError, Problem, UnknownPluginError, one_of
 from labseq.files import PLUGIN_PATH, PLUGINS
 from labseq.hookspecs import LABSEQ_API
 from labseq.messages import format_error
@@ -326,19 +327,25 @@ class PluginHost:
         """
         if (kind, name) in self.registry.contested:
             raise self.registry.contested[kind, name]
-        try:
-            entry = self.registry.get(kind, name)
-        except UnknownPluginError as error:
-            broken = [info for info in self._infos.values() if info.state == "failed"]
-            for info in broken:
-                if info.name.removeprefix("labseq_").split(" ")[0] == name.removeprefix("labseq_"):
-                    raise PluginLoadError(info.name, info.reason, info.source) from None
-            hints = [error.hint, advice(kind, name, file)]
-            if kind not in ("step", "pattern"):
-                hints += [f"plugin '{info.name}' did not load ({info.reason})" for info in broken]
-            raise UnknownPluginError(kind, name, error.known, "; ".join(filter(None, hints))) from None
+        entry = self.registry.find(kind, name)
+        if entry is None:
+            raise self._unknown(kind, name, file)
         self._used.add(entry.origin)
         return entry
+
+    def _unknown(self, kind: str, name: str, file: Path | None) -> LabseqError:
+        """The error for a name that no plugin offers: most likely its plugin did not load, or is misspelt."""
+        broken = [info for info in self._infos.values() if info.state == "failed"]
+        for info in broken:
+            if info.name.removeprefix("labseq_").split(" ")[0] == name.removeprefix("labseq_"):
+                return PluginLoadError(info.name, info.reason, info.source)
+        known = self.registry.names(kind)
+        hints = [f"did you mean '{near}'?" for near in difflib.get_close_matches(name, known, n=1)]
+        hints.append(advice(kind, name, file))
+        # steps and patterns are mostly labseq's own: such a name is more likely misspelt
+        if kind not in ("step", "pattern"):
+            hints += [f"plugin '{info.name}' did not load ({info.reason})" for info in broken]
+        return UnknownPluginError(kind, name, known, "; ".join(filter(None, hints)))
 
     def listeners(self, hook: str, **values: Any) -> list[tuple[str, Callable[[], object]]]:
         """Name of each plugin that implements an observer hook, and the call of the hook."""
