@@ -28,7 +28,7 @@ from labseq import builtin
 from labseq.cli.app import app
 from labseq.errors import LabseqError, Problem
 from labseq.model.policies import StepPolicy
-from labseq.plugins import ENTRY_POINT_GROUP, PluginHost
+from labseq.plugins.host import ENTRY_POINT_GROUP, PluginHost
 from labseq.registry import Registry
 from labseq.roles import ROLES
 from labseq.scaffold import reference
@@ -115,7 +115,9 @@ def registry() -> Registry:
 def settings(kind: str, *names: str) -> list[Block]:
     """The keys of a file, of a part of it, or of a plugin; "top" leaves out those of its parts."""
     if kind in ROLES:
-        return [reference.settings(registry().get(kind, *names).settings_model)]
+        entry = registry().find(kind, *names)
+        assert entry is not None, names
+        return [reference.settings(entry.settings_model)]
     keys = [name for name in names if name != "top"]
     return [file_settings(kind, *keys, top="top" in names)]
 

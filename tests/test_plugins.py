@@ -10,7 +10,8 @@ import pytest
 
 from labseq import hookspecs
 from labseq.errors import ConfigError, PluginLoadError, UnknownPluginError
-from labseq.plugins import LOCAL_PACKAGE, PluginHost
+from labseq.plugins.calls import LOCAL_PACKAGE
+from labseq.plugins.host import PluginHost
 from labseq.settings import Settings
 
 GOOD = """

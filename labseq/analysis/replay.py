@@ -18,7 +18,7 @@ from labseq.assembly.occupancies import image_before
 from labseq.assembly.options import Options
 from labseq.assembly.planning import call_planner
 from labseq.assembly.plugin_choice import ChosenPlugin, changed_settings, resolve
-from labseq.assembly.points import Point
+from labseq.assembly.point import Point
 from labseq.assembly.recorded import calibrations_of, files_of, machine_of
 from labseq.config.addresses import Override, split_overrides
 from labseq.data import Run, Shot

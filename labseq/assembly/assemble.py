@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from labseq.assembly.options import NOT_SET, Options
+from labseq.assembly.options import NOT_SET, DryRun, Options
 from labseq.assembly.plugin_choice import (
     ChosenPlugin,
-    DryRun,
-    check_dry_run,
     construct_one,
     construct_target,
     dump,
@@ -19,25 +17,25 @@ from labseq.assembly.plugin_choice import (
     read_settings,
     resolve,
 )
-from labseq.assembly.points import Point, ScanPoints, make_step, place_note
-from labseq.assembly.policies import make_policy, with_policies
+from labseq.assembly.point import Point, make_step, place_note
 from labseq.assembly.profile import ResolvedProfile, resolve_profile
-from labseq.assembly.search import Search, make_search
 from labseq.config.addresses import PROFILE, PROFILE_ROLES, find, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_sequence
-from labseq.config.scan import AdaptiveScan, Scan
-from labseq.config.sequence import SequenceSpec, load_sequence
+from labseq.config.sequence import SequenceSpec, StepSpec, load_sequence
 from labseq.errors import ConfigError, LabseqError, Loc, PluginLoadError, ProblemCollector
 from labseq.model import TargetPattern
-from labseq.model.policies import RunPolicy
+from labseq.model.policies import NO_POLICY, RunPolicy, StepPolicy
 from labseq.recording.results import PREFIX
 from labseq.roles import Context, Step
-from labseq.settings import si_unit_at
+from labseq.settings import settings_of, si_unit_at
 from labseq.units import si_unit_of
 
 if TYPE_CHECKING:
+    from labseq.assembly.points import ScanPoints
     from labseq.assembly.recorded import RecordedFiles
+    from labseq.assembly.search import Search
+    from labseq.config.scan import Scan
 
 
 class Setting(NamedTuple):
@@ -187,7 +185,6 @@ def assemble(
         PluginLoadError: A named plugin failed to load.
     """
     profile, dry_run = options.profile, options.dry_run
-    check_dry_run(dry_run)
     sequence_path = sequence_path if kept is not None else find_sequence(sequence_path)
     for_sequence, for_profile = split_overrides(options.overrides)
     profile_set = [override._replace(address=f"profile.{override.address}") for override in for_profile]
@@ -248,11 +245,13 @@ def _assembled(
     search: Search | None = None
     try:
         if scan is not None and is_whole:
-            scan = scan.bound(hardware.document)
-            scanned = ScanPoints(scan, document, sequence, hardware)
+            # a run without a scan does not need these
+            from labseq.assembly.points import ScanPoints
+            from labseq.assembly.search import make_search
+
+            scanned = ScanPoints(scan.bound(hardware.document), document, sequence, hardware)
             scanned.check(problems)
-            if isinstance(scan, AdaptiveScan) and not problems.problems:
-                search = make_search(scan, scanned, steps, results, problems)
+            search = make_search(scanned, steps, results, problems)
         problems.raise_any()
     except ConfigError as error:
         raise _explained(error, scan) from None
@@ -382,6 +381,56 @@ def make_analyses(
             dumps.append({**chosen.dump(), "finish_within": choice.finish_within})
         results += [f"{prefix}{name}" for name in getattr(instance, "results", ("",))]
     return dumps, results
+
+
+def make_policy(
+    document: Document,
+    sequence: SequenceSpec,
+    steps: Sequence[tuple[str, Step]],
+    results: Collection[str],
+    problems: ProblemCollector,
+) -> RunPolicy:
+    """The policies of a run and its steps."""
+    own = sequence.policy
+    otherwise = StepPolicy(on_failure=own.on_failure, over_budget=own.over_budget)
+    policies = [NO_POLICY] * len(sequence.shot)
+    for number, spec in enumerate(sequence.shot):
+        with problems:
+            policies[number] = _step_policy(document, spec, otherwise)
+    is_whole = len(steps) == len(sequence.shot)
+    for number, (spec, policy) in enumerate(zip(sequence.shot, policies, strict=True)):
+        if is_whole and policy.retries and not steps[number][1].repeatable:
+            what = f"'{spec.kind}' cannot be tried again in the same shot: atoms may have moved"
+            hint = "write 'on_failure: repeat_shot'"
+            problems.add(document.error((*spec.policy_loc, "retries"), what, "0", hint, key=True))
+    if own.checks:
+        from labseq.assembly.quantities import check_checks  # loads what a run without checks does not need
+
+        check_checks(document, sequence, steps if is_whole else None, results, problems)
+    return RunPolicy(sequence.attempts, own.when_exhausted, otherwise, tuple(policies))
+
+
+def with_policies(
+    document: Document, sequence: SequenceSpec, dumps: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """The settings of the steps for the record, each with its policy."""
+    steps = [dict(dumped) for dumped in dumps]
+    for spec, dumped in zip(sequence.shot, steps, strict=True):
+        if document.root.at(spec.policy_loc) is not None:
+            policy = document.validate(StepPolicy, spec.policy_loc)
+            written = document.get(spec.policy_loc) or {}
+            settings = [setting for setting in settings_of(StepPolicy) if setting.key in written]
+            dumped["policy"] = {setting.key: getattr(policy, setting.name) for setting in settings}
+    return steps
+
+
+def _step_policy(document: Document, spec: StepSpec, otherwise: StepPolicy) -> StepPolicy:
+    own = document.validate(StepPolicy, spec.policy_loc, called=f"the policy of '{spec.kind}'")
+    return replace(
+        own,
+        on_failure=own.on_failure or otherwise.on_failure,
+        over_budget=own.over_budget or otherwise.over_budget,
+    )
 
 
 def _grid_note(hardware: ResolvedProfile) -> str:

@@ -18,7 +18,7 @@ from labseq.model.calibration import correct_overlay
 from labseq.registry import VIRTUAL_TWIN
 
 if TYPE_CHECKING:
-    from labseq.assembly.plugin_choice import DryRun
+    from labseq.assembly.options import DryRun
 
 FOLDER: Final = "calibrations"
 

@@ -15,13 +15,13 @@ from labseq.errors import ConfigError, LabseqError, PlanError
 from labseq.guard import Guard, StopFlag
 from labseq.kernels.kernel import announcing, load_kernels
 from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
-from labseq.plugins import call_plugin
+from labseq.plugins.calls import call_plugin
 from labseq.roles import Clock, Context, NeedsWarmUp, Planner, RunObserver, Simulation
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Lab
 
 if TYPE_CHECKING:
-    from labseq.assembly.points import Point
+    from labseq.assembly.point import Point
 
 DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "eject_slots"})
 """Keys of the motion that mobile tweezers need when they are opened; only the core uses the others."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self, get_args
 
-from labseq.assembly.plugin_choice import DryRun
 from labseq.config.addresses import Override
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
+
+DryRun = Literal["off", "full", "fast"]
 
 NOT_SET: Final = ("profile", "dry_run")
 """Options that do not replace a value of the sequence."""
@@ -26,6 +27,18 @@ def path_of(value: Any, name: str) -> Path:
         return Path(value)
     except TypeError:
         raise ConfigError(Problem(f"{name} is {clean(repr(value))}", expected="a path")) from None
+
+
+def check_dry_run(dry_run: object) -> None:
+    """Raise for an unknown kind of dry run, so that a typing error cannot open hardware.
+
+    Raises:
+        ConfigError: It is unknown.
+    """
+    if dry_run not in get_args(DryRun):
+        raise ConfigError(
+            Problem(f"dry_run is {dry_run!r}", expected=f"one of {', '.join(map(repr, get_args(DryRun)))}")
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +68,7 @@ class Options:
         if not isinstance(self.profile, str | Path | None):  # pyright: ignore[reportUnnecessaryIsInstance]
             what = f"profile is {clean(repr(self.profile))}"
             raise ConfigError(Problem(what, expected="the name or the path of a hardware profile"))
+        check_dry_run(self.dry_run)
 
     @classmethod
     def of(cls, changes: Mapping[str, Any], *, realtime: bool = False) -> Self:

@@ -31,8 +31,8 @@ from labseq.guard import Guard
 from labseq.messages import clean, format_error, visible
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import Survival, check_plan, predict_survival
-from labseq.plugins import PluginHost
 from labseq.plugins.calls import error_location
+from labseq.plugins.host import PluginHost
 from labseq.roles import Planner
 from labseq.settings import Choice, PatternChoice
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 from labseq import builtin as builtins
 from labseq.config import addresses
@@ -18,18 +18,16 @@ from labseq.errors import (
     LimitError,
     Loc,
     PluginLoadError,
-    Problem,
     UnknownPluginError,
     one_of,
 )
 from labseq.messages import clean
 from labseq.model import ScanSpace, SiteGrid, TargetPattern
-from labseq.plugins import PluginHost, call_plugin
+from labseq.plugins.calls import call_plugin
+from labseq.plugins.host import PluginHost
 from labseq.registry import LOAD_S, Entry
 from labseq.roles import Context
 from labseq.settings import Choice, NoSettings, Settings
-
-DryRun = Literal["off", "full", "fast"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,18 +152,6 @@ def read_settings(
     except PluginLoadError as error:
         raise document.error(loc, str(error)) from error
     return None if entry.settings_model is None else settings
-
-
-def check_dry_run(dry_run: object) -> None:
-    """Raise for an unknown kind of dry run, so that a typing error cannot open hardware.
-
-    Raises:
-        ConfigError: It is unknown.
-    """
-    if dry_run not in get_args(DryRun):
-        raise ConfigError(
-            Problem(f"dry_run is {dry_run!r}", expected=f"one of {', '.join(map(repr, get_args(DryRun)))}")
-        )
 
 
 def dump(entry: Entry, settings: Settings | None) -> dict[str, Any]:

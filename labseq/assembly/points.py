@@ -9,68 +9,30 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from labseq.assembly.plugin_choice import (
-    ChosenPlugin,
-    construct_role,
-    dump,
-    find_entry,
-    read_settings,
-    resolve,
-)
+from labseq.assembly.plugin_choice import resolve
+from labseq.assembly.point import Made, Point, make_step
 from labseq.config.addresses import PROFILE, PROFILE_ROLES, VARIABLES
 from labseq.config.scan import Axis, Scan, put
-from labseq.errors import ConfigError, Loc, PluginLoadError, ProblemCollector, one_of
+from labseq.errors import ConfigError, Loc, ProblemCollector
 from labseq.messages import clean
-from labseq.settings import Choice, settings_of
+from labseq.settings import Choice
 from labseq.units import parse_any
 
 if TYPE_CHECKING:
     from labseq.assembly.profile import ResolvedProfile
     from labseq.config.document import Document
-    from labseq.config.sequence import SequenceSpec, StepSpec
+    from labseq.config.sequence import SequenceSpec
     from labseq.config.yaml_nodes import Node
-    from labseq.roles import Step
 
 MAX_PROBLEMS: Final = 20
 """The check of a scan stops after this number of problems."""
 _PLANNER: Final[Loc] = ("planner",)
 
 T = TypeVar("T")
-
-
-class Made(NamedTuple, Generic[T]):
-    """A planner or step, and its settings after defaults, SI, JSON-ready."""
-
-    plugin: T
-    dump: Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """A run's settings at one point.
-
-    Attributes:
-        planner: The planner and its settings.
-        steps: Name and step, in order.
-        hardware: The profile.
-        parameters: Scanned address -> value, SI, JSON-ready.
-        document: The sequence's file with the values of the point.
-    """
-
-    planner: ChosenPlugin
-    steps: tuple[tuple[str, Step], ...]
-    hardware: ResolvedProfile
-    parameters: Mapping[str, Any]
-    document: Document
-
-    @property
-    def lab_key(self) -> tuple[int, int]:
-        """The same for points that need the same devices and planner, as long as these points exist."""
-        return id(self.planner), id(self.hardware)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,43 +225,3 @@ def _setting(made: Mapping[Loc, Made[Any]], hardware: ResolvedProfile, of_profil
 def _si(value: Any) -> Any:
     """The value of a variable in SI."""
     return parse_any(value)[0] if isinstance(value, str) else value
-
-
-def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> Made[Step]:
-    """A step of a sequence, and its settings for the record.
-
-    Raises:
-        ConfigError: The step is unknown, its settings are invalid, or the profile lacks the device that it
-            names; with their place.
-    """
-    entry = find_entry(hardware.host, document, "step", spec.kind, spec.loc, key=True)
-    for key in {"name", "policy"} - {setting.key for setting in settings_of(entry.settings_model)}:
-        if document.root.at((*spec.loc, key)) is not None:
-            what, hint = (
-                f"'{key}' is in the settings of '{spec.kind}'",
-                f"write '{key}' on a line of its own below",
-            )
-            raise document.error((*spec.loc, key), what, f"'{key}' beside '{spec.kind}'", hint, key=True)
-    settings = read_settings(document, entry, spec.loc)
-    try:
-        step, dumped = construct_role(entry, settings), dump(entry, settings)
-    except (ConfigError, PluginLoadError) as error:
-        raise document.error(spec.loc, str(error)) from error
-    key, devices = step.device_setting, hardware.profile.devices
-    name = getattr(settings, key, None) if key else None
-    may_be_camera = step.device_may_be_camera
-    known = [one for one, choice in devices.items() if may_be_camera or choice.role == "device"]
-    known += ["camera"] if may_be_camera else []
-    if name is not None and name not in known:
-        what = f"the profile '{hardware.profile.name}' has no device '{name}'"
-        if name in devices:
-            what = f"'{name}' is a camera, which '{spec.kind}' cannot use"
-        problem = document.problem((*spec.loc, key), what, one_of(sorted(known)))
-        raise ConfigError(replace(problem, notes=(place_note(hardware.document, "devices"),)))
-    return Made(step, dumped)
-
-
-def place_note(document: Document, key: str) -> str:
-    """The note of a problem that names the place of a key in the other file."""
-    line, column = document.locate((key,), key=True)
-    return f"see '{key}' at {document.path}:{line}:{column}"

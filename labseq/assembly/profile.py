@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from labseq.assembly.calibrations import ActiveCalibrations, calibrated, with_calibrations
-from labseq.assembly.plugin_choice import ChosenPlugin, DryRun, load_plugins, resolve
+from labseq.assembly.options import DryRun
+from labseq.assembly.plugin_choice import ChosenPlugin, load_plugins, resolve
 from labseq.config.addresses import Override
 from labseq.config.document import Document, plugin_paths
 from labseq.config.profile import DeviceChoice, MobileTweezersChoice, ProfileSpec, load_profile
-from labseq.config.scan import Scan
 from labseq.errors import (
     ConfigError,
     PluginLoadError,
@@ -24,7 +24,7 @@ from labseq.errors import (
 from labseq.messages import clean, did_you_mean
 from labseq.model import CalibrationEntry, MotionSpec, SiteGrid
 from labseq.model.lines import IDLE
-from labseq.plugins import PluginHost
+from labseq.plugins.host import PluginHost
 from labseq.registry import VIRTUAL_TWIN
 from labseq.roles import ROLES, Clock, Context
 from labseq.sequencer.lines import trigger_line
@@ -32,6 +32,7 @@ from labseq.settings import Choice
 
 if TYPE_CHECKING:
     from labseq.assembly.recorded import RecordedFiles
+    from labseq.config.scan import Scan
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from labseq.data.reader import Run
 from labseq.errors import RecordingError
 from labseq.files import read_file
 from labseq.model import CalibrationEntry, MotionSpec, RandomStream, SiteGrid
-from labseq.plugins import PluginHost
+from labseq.plugins.host import PluginHost
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context

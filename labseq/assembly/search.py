@@ -8,17 +8,19 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_one, resolve
-from labseq.assembly.policies import check_quantity
-from labseq.data.points import SCANNER
+from labseq.assembly.quantities import check_quantity
+from labseq.config.scan import AdaptiveScan
 from labseq.errors import ConfigError, DeviceError, ProblemCollector
 from labseq.guard import Guard, StopFlag
 from labseq.messages import clean
 from labseq.model import ScanRange, ScanSpace, VisitedPoint
+from labseq.recording.run_file import SCANNER
 from labseq.units import written
 
 if TYPE_CHECKING:
-    from labseq.assembly.points import Point, ScanPoints
-    from labseq.config.scan import AdaptiveScan, RangeAxis
+    from labseq.assembly.point import Point
+    from labseq.assembly.points import ScanPoints
+    from labseq.config.scan import RangeAxis
     from labseq.roles import Scanner, Step
 
 TO_OPTIMISE: Final = "to optimise"
@@ -154,22 +156,23 @@ def _names(addresses: Iterable[Any]) -> str:
 
 
 def make_search(
-    scan: AdaptiveScan,
     corners: ScanPoints,
     steps: Sequence[tuple[str, Step]],
     results: Collection[str],
     problems: ProblemCollector,
 ) -> Search | None:
-    """Choose and check the scanner of a scan; None if there is a problem.
+    """Choose and check the scanner of a scan; None if its points are listed, or if there is a problem.
 
     The scanner is constructed once, to check that its constructor accepts the settings.
 
     Args:
-        scan: The scan, its axes bound to the profile.
-        corners: The corners of its ranges, checked.
-        results: Names of the results of the analyses, see :func:`labseq.assembly.policies.check_quantity`.
+        corners: The points of the scan, checked: of an adaptive scan, the corners of its ranges.
+        results: Names of the results of the analyses, see :func:`labseq.assembly.quantities.check_quantity`.
     """
-    n_before, document, choice = len(problems.problems), corners.document, scan.choice
+    scan = corners.scan
+    if not isinstance(scan, AdaptiveScan) or problems.problems:
+        return None
+    document, choice = corners.document, scan.choice
     with problems:
         check_quantity(document, choice.aim, choice.quantity, TO_OPTIMISE, steps, results)
     chosen: ChosenPlugin | None = None
@@ -182,7 +185,7 @@ def make_search(
         with problems:
             resolved = low[axis.address], high[axis.address]
             ranges.append(_range(axis, resolved, corners.present(axis)))
-    if chosen is None or len(problems.problems) > n_before:
+    if chosen is None or problems.problems:
         return None
     search = Search(scan, corners, chosen, tuple(ranges))
     with problems:

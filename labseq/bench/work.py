@@ -23,7 +23,7 @@ from labseq.kernels.kernel import load_kernels
 from labseq.messages import format_error
 from labseq.model import MotionSpec, Occupancy, SiteGrid, TargetPattern
 from labseq.motion import check_plan, predict_survival
-from labseq.plugins import PluginHost
+from labseq.plugins.host import PluginHost
 from labseq.roles import NeedsWarmUp, Planner
 from labseq.settings import Choice, settings_at
 

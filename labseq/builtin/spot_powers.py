@@ -16,7 +16,7 @@ from labseq.detection.lattice import find_lattice
 from labseq.detection.spots import KnownSpots, without_hot_pixels
 from labseq.errors import ConfigError, DeviceError, TransientError
 from labseq.model import Frame, SiteGrid
-from labseq.motion import all_on_program
+from labseq.motion.hold import all_on_program
 from labseq.roles import Shot
 
 Floats = NDArray[np.float64]

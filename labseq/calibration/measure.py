@@ -13,7 +13,7 @@ import numpy as np
 
 import labseq
 from labseq.assembly.calibrations import store_of, why_left_out
-from labseq.assembly.plugin_choice import DryRun
+from labseq.assembly.options import DryRun
 from labseq.assembly.profile import ResolvedProfile, resolve_profile
 from labseq.assembly.recorded import recorded_machine
 from labseq.calibration.compare import Difference, compare

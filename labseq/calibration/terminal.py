@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.assembly.calibrations import open_store
-from labseq.assembly.plugin_choice import DryRun
+from labseq.assembly.options import DryRun
 from labseq.calibration.compare import Difference, age_s, compare, quality_text, quantity
 from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
 from labseq.calibration_store import Damaged, Store, Stored, grid_text

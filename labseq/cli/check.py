@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from labseq.assembly.assemble import Assembly
-from labseq.assembly.plugin_choice import DryRun
+from labseq.assembly.options import DryRun
 from labseq.assembly.search import Search
 from labseq.calibration.compare import age_s, quality_text
 from labseq.config.scan import Axis

@@ -8,7 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.assembly.plugin_choice import DryRun, load_plugins
+from labseq.assembly.options import DryRun
+from labseq.assembly.plugin_choice import load_plugins
 from labseq.config.document import plugin_paths
 from labseq.config.profile import load_profile
 from labseq.console.errors import report
@@ -18,7 +19,7 @@ from labseq.console.text import time_text
 from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.kernels.kernel import announcing
 from labseq.messages import clean
-from labseq.plugins import PluginHost, PluginInfo
+from labseq.plugins.host import PluginHost, PluginInfo
 from labseq.safety.devices import CheckedDevice, DevicesReport, check_devices
 from labseq.safety.safe import make_profile_safe, stand_by
 

@@ -22,10 +22,11 @@ from rich.text import Text
 from labseq.console.arrays import Glyphs, draw_array, glyphs_for, scales
 from labseq.console.events import LASTING, LogLines, best_text, event_text, scanned_names
 from labseq.console.text import clock_time, count_of, plural
-from labseq.data.points import SCANNER, ChosenPoints
+from labseq.data.points import ChosenPoints
 from labseq.model import ImageRecord, RunRecord, StageTiming
 from labseq.model.estimate import Estimate, jeffreys, mean
 from labseq.recording.index import IndexRow
+from labseq.recording.run_file import SCANNER
 from labseq.units import format_quantity
 
 REDRAW_S: Final = 0.25

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
 
 from labseq.config.addresses import Override, find
-from labseq.config.expressions import Expressions, evaluate
 from labseq.config.validation import ValidationContext, check, node_of, validate
 from labseq.config.yaml_nodes import Mark, Node, compose
 from labseq.errors import ConfigError, Loc, Problem, ProblemCollector, collecting
@@ -33,6 +32,32 @@ class StoredText(NamedTuple):
 
     text: str
     name: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expressions:
+    """The expressions of a file.
+
+    Attributes:
+        written: The file with its expressions.
+        root: The same with their values.
+        texts: Place of each expression -> its text.
+        reads: Place of each expression -> the places of all values that it depends on, also indirectly.
+    """
+
+    written: Node
+    root: Node
+    texts: Mapping[Loc, str]
+    reads: Mapping[Loc, frozenset[Loc]]
+
+    def following(self, loc: Loc) -> list[Loc]:
+        """The expressions that depend on a value, or on a part of it."""
+        return [reader for reader, read in self.reads.items() if any(_overlap(loc, other) for other in read)]
+
+
+def _overlap(loc: Loc, other: Loc) -> bool:
+    n = min(len(loc), len(other))
+    return loc[:n] == other[:n]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +136,13 @@ class Document:
         Raises:
             ConfigError: All errors in them.
         """
-        expressions = evaluate(self.written, self.text)
+        written = self.written
+        texts = (node.value for _, node in written.leaves() if isinstance(node.value, str))
+        if not any(text.startswith("=") for text in texts):
+            return replace(self, root=written, expressions=Expressions(written, written, {}, {}))
+        from labseq.config.expressions import evaluate  # most files have none
+
+        expressions = Expressions(written, *evaluate(written, self.text))
         return replace(self, root=expressions.root, expressions=expressions)
 
     def get(self, loc: Loc, default: Any = None) -> Any:

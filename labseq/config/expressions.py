@@ -338,42 +338,20 @@ class _Evaluation:
 _KNOWN: Final = "an expression can use values of its own file, not defaults"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Expressions:
-    """The expressions of a file.
-
-    Attributes:
-        written: The file with its expressions.
-        root: The same with their values.
-        texts: Place of each expression -> its text.
-        reads: Place of each expression -> the places of all values that it depends on, also indirectly.
-    """
-
-    written: Node
-    root: Node
-    texts: Mapping[Loc, str]
-    reads: Mapping[Loc, frozenset[Loc]]
-
-    def following(self, loc: Loc) -> list[Loc]:
-        """The expressions that depend on a value, or on a part of it."""
-        return [reader for reader, read in self.reads.items() if any(_overlap(loc, other) for other in read)]
-
-
-def _overlap(loc: Loc, other: Loc) -> bool:
-    n = min(len(loc), len(other))
-    return loc[:n] == other[:n]
-
-
 def is_expression(node: Node) -> bool:
     """Whether a value is an expression."""
     return isinstance(node.value, str) and node.value.startswith("=") and not node.value.startswith("==")
 
 
-def evaluate(root: Node, text: str) -> Expressions:
+def evaluate(root: Node, text: str) -> tuple[Node, dict[Loc, str], dict[Loc, frozenset[Loc]]]:
     """Compute all expressions of a file.
 
     Args:
+        root: The file with its expressions.
         text: Its text, for places within expressions.
+
+    Returns:
+        The file with their values, the text of each, and the places of all values that each depends on.
 
     Raises:
         ConfigError: All errors in them.
@@ -397,7 +375,7 @@ def evaluate(root: Node, text: str) -> Expressions:
         node = replace(evaluator.nodes[loc], value=value, raw=str(value))
         result = result.replaced(loc, node, same_key=True)
     texts = {loc: str(node.value) for loc, node in evaluator.nodes.items()}
-    return Expressions(root, result, texts, evaluator.reads)
+    return result, texts, evaluator.reads
 
 
 @dataclass(slots=True)

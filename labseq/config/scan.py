@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Final, Literal, NamedTuple, Self, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, NamedTuple, Self, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,12 @@ from pydantic import Field, WithJsonSchema, model_validator
 
 from labseq.config.addresses import MAY_ADD, PROFILE, PROFILE_ROLES, VARIABLES, Override, find
 from labseq.config.document import Document
+from labseq.config.sequence import ScanOrder
 from labseq.config.yaml_nodes import Mark, Node
 from labseq.errors import ConfigError, Loc, Problem, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing, shown
 from labseq.settings import Choice, Settings, Text, setting_error
 from labseq.units import UNITS, dimension_of, factor_of, scaled, split_quantity, written
-
-ScanOrder = Literal["sequential", "shuffled"]
 
 MAX_POINTS: Final = 10_000
 """Maximum number of points of a scan, and of values of an address."""
@@ -280,28 +279,58 @@ class AdaptiveScan(Scan):
         return document
 
 
-def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan | None:
-    """Read ``scan``, ``repeats`` and ``order`` of a sequence.
+def at_first_point(
+    document: Document,
+    overrides: Sequence[Override | tuple[str, str]],
+    profile_set: Sequence[Override],
+    problems: ProblemCollector,
+) -> tuple[Document, Scan | None]:
+    """A copy with the values of the first point and with ``shots`` from the scan; and the scan.
+
+    Args:
+        document: A sequence with a scan.
+        overrides: Its overrides.
+        profile_set: Those of the profile, with their "profile.".
+        problems: Receives those of the scan; without a valid scan the copy has none.
+    """
+    of_sequence = [Override(*override) for override in overrides]
+    try:
+        scan = read_scan(document, [*of_sequence, *profile_set])
+    except ConfigError as error:
+        problems.add(error)
+        return _without_scan(document), None
+    n_shots, shots = scan.n_points * scan.repeats, document.data.get("shots")
+    is_option = any(override.address == "shots" for override in of_sequence)
+    if shots is None:
+        document = document.override("shots", str(n_shots), "the scan")
+    elif type(shots) is int and (shots > n_shots if is_option else shots != n_shots):
+        what = f"shots is {shots}, but the scan has {scan.n_points} x {scan.repeats} = {n_shots}"
+        expected = f"at most {n_shots}" if is_option else ""
+        hint = "write 'repeats' for more" if is_option else "leave 'shots' out, it follows from the scan"
+        problems.add(document.error(("shots",), what + " (points x repeats)", expected, hint))
+    return scan.at_first_point(document, profile=False), scan
+
+
+def _without_scan(document: Document) -> Document:
+    for key, value in (("scan", "~"), ("shots", str(document.data.get("shots") or 1))):
+        document = document.override(key, value, "the scan")
+    return document
+
+
+def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan:
+    """Read ``scan``, ``repeats`` and ``order`` of a sequence that has a scan.
 
     Args:
         fixed: The overrides, those of the profile with their "profile."; an axis that one of
             them sets is left out, since ``--set`` takes precedence.
 
     Returns:
-        The scan, its profile axes not yet bound; None if the sequence has none.
+        The scan, its profile axes not yet bound.
 
     Raises:
         ConfigError: All errors in its form.
     """
-    node = document.root.child("scan")
-    if node is None or node.value is None:
-        problems = ProblemCollector()
-        for key in ("repeats", "order"):
-            if document.get((key,)) is not None:
-                what = f"'{key}' is given without a scan"
-                problems.add(document.error((key,), what, "a 'scan' beside it", key=True))
-        problems.raise_any()
-        return None
+    node = cast("Node", document.root.child("scan"))
     if isinstance(node.value, dict) and "use" in node.value:
         return _read_adaptive(document, fixed)
     return _read_listed(document, node, fixed)

@@ -6,13 +6,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self, TypeAlias, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlias, cast
 
 from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
 from labseq.config.addresses import Override
 from labseq.config.document import Document, FallbackValues, StoredText, check_kind, load_checked
-from labseq.config.scan import Scan, ScanOrder, read_scan
 from labseq.errors import Loc, ProblemCollector, collecting
 from labseq.messages import clean, shown
 from labseq.model.policies import OverBudget, Then, WhenExhausted
@@ -31,6 +30,11 @@ from labseq.settings import (
     placed_by_field,
     setting_error,
 )
+
+if TYPE_CHECKING:
+    from labseq.config.scan import Scan
+
+ScanOrder = Literal["sequential", "shuffled"]
 
 
 class CheckSettings(Settings):
@@ -243,37 +247,19 @@ def load_sequence(
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
     with collecting(problems) as collector:
         document = document.override_all(overrides, collector, may_add=("policy",)).evaluated()
-        document, scan = _at_first_point(
-            document, [Override(*pair) for pair in overrides], profile_set, collector
-        )
+        scan: Scan | None = None
+        if document.data.get("scan") is None:
+            _refuse_without_scan(document, collector)
+        else:
+            from labseq.config.scan import at_first_point  # a sequence without a scan does not need it
+
+            document, scan = at_first_point(document, overrides, profile_set, collector)
         return *load_checked(document, SequenceSpec, "a sequence", _FALLBACKS, collector), scan
 
 
-def _at_first_point(
-    document: Document,
-    overrides: Sequence[Override],
-    profile_set: Sequence[Override],
-    problems: ProblemCollector,
-) -> tuple[Document, Scan | None]:
-    """A copy with the values of the first point and with ``shots`` from the scan; and the scan."""
-    scan: Scan | None = None
-    with problems:
-        scan = read_scan(document, [*overrides, *profile_set])
-    if scan is None:  # there is no scan, or it has an error
-        return document if document.data.get("scan") is None else _without_scan(document), None
-    n_shots, shots = scan.n_points * scan.repeats, document.data.get("shots")
-    is_option = any(override.address == "shots" for override in overrides)
-    if shots is None:
-        document = document.override("shots", str(n_shots), "the scan")
-    elif type(shots) is int and (shots > n_shots if is_option else shots != n_shots):
-        what = f"shots is {shots}, but the scan has {scan.n_points} x {scan.repeats} = {n_shots}"
-        expected = f"at most {n_shots}" if is_option else ""
-        hint = "write 'repeats' for more" if is_option else "leave 'shots' out, it follows from the scan"
-        problems.add(document.error(("shots",), what + " (points x repeats)", expected, hint))
-    return scan.at_first_point(document, profile=False), scan
-
-
-def _without_scan(document: Document) -> Document:
-    for key, value in (("scan", "~"), ("shots", str(document.data.get("shots") or 1))):
-        document = document.override(key, value, "the scan")
-    return document
+def _refuse_without_scan(document: Document, problems: ProblemCollector) -> None:
+    """Find settings of a scan in a sequence without one."""
+    for key in ("repeats", "order"):
+        if document.get((key,)) is not None:
+            what = f"'{key}' is given without a scan"
+            problems.add(document.error((key,), what, "a 'scan' beside it", key=True))

@@ -1,7 +1,6 @@
 """Reads recorded runs, in progress or finished: shots, quantities, tables, exports."""
 
-from labseq.data.columns import quantities_in
 from labseq.data.reader import Run, open_run
 from labseq.data.shot import Shot
 
-__all__ = ["Run", "Shot", "open_run", "quantities_in"]
+__all__ = ["Run", "Shot", "open_run"]

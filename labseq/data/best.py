@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.data.points import SCANNER, ScanPoint, reporting_damage, scan_points
+from labseq.data.points import ScanPoint, reporting_damage, scan_points
 from labseq.data.quantities import Quantity, quantity_of
 from labseq.data.reader import Run
 from labseq.model import ScanRange
 from labseq.model.estimate import Estimated
+from labseq.recording.run_file import SCANNER
 from labseq.units import written
 
 

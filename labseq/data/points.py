@@ -6,7 +6,7 @@ from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from labseq.errors import RecordingError
 from labseq.plain import dumps
@@ -17,9 +17,6 @@ from labseq.units import written
 if TYPE_CHECKING:
     from labseq.data.reader import Run
     from labseq.data.shot import Shot
-
-SCANNER: Final = "scanner"
-"""Key in the record of an adaptive scan (and no other): the scanner and its settings."""
 
 
 @contextmanager

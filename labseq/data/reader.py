@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from labseq.data.points import SCANNER, completed, reporting_damage
 from labseq.data.shot import Shot, caching_loader
 from labseq.errors import RecordingError
 from labseq.files import read_lines
@@ -18,8 +17,7 @@ from labseq.model.records import RunStatus
 from labseq.plain import to_plain
 from labseq.recording import folders
 from labseq.recording.index import read_index
-from labseq.recording.results import rows_of
-from labseq.recording.run_file import is_skip_row, read_run, read_state, target_of
+from labseq.recording.run_file import SCANNER, is_skip_row, read_run, read_state, target_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -146,6 +144,8 @@ class Run:
         scan: Mapping[str, Any] = self.record.get("scan") or {}
         if SCANNER not in scan:
             return scan
+        from labseq.data.points import completed, reporting_damage
+
         with reporting_damage(self.path):
             return completed(scan, [shot.row for shot in (*self.shots, *self.attempts)])
 
@@ -179,6 +179,8 @@ class Run:
         Raises:
             RecordingError: There are no results of that name, or they cannot be read.
         """
+        from labseq.recording.results import rows_of
+
         return rows_of(self.path, name)
 
     def quantity(self, name: str) -> Quantity:

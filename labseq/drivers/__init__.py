@@ -5,6 +5,6 @@ its lost frames and its errors are the same for all cameras, and are handled onc
 """
 
 from labseq.drivers.camera import CameraDriver, Cooling, ExposureResult, Series, SimulatedSensor, settle
-from labseq.drivers.serial_port import wait_for
+from labseq.drivers.waiting import wait_for
 
 __all__ = ["CameraDriver", "Cooling", "ExposureResult", "Series", "SimulatedSensor", "settle", "wait_for"]

@@ -1,4 +1,4 @@
-"""Serial lines, and waiting for a condition with a deadline."""
+"""Serial lines."""
 
 from __future__ import annotations
 
@@ -6,50 +6,15 @@ import errno
 import importlib
 import os
 import re
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, Protocol
 from urllib.parse import urlsplit
 
+from labseq.drivers.waiting import SLICE_S
 from labseq.errors import DeviceError
-from labseq.roles import Clock, Emergency
-
-T = TypeVar("T")
-
-SLICE_S: Final = 0.02
-"""Longest single wait in seconds: how soon a stop request is seen."""
-
-
-def wait_for(poll: Callable[[float], T | None], timeout_s: float, clock: Clock) -> T | None:
-    """Wait until something comes from a device that runs in real time.
-
-    If nothing comes, a virtual clock moves on by the whole wait, too.
-
-    Args:
-        poll: Waits for at most so many seconds; None if nothing came.
-        timeout_s: How long to wait in all, in seconds; 0 looks once.
-        clock: The session's clock: asked for a stop request before each look.
-
-    Returns:
-        What came; None if nothing did.
-
-    Raises:
-        StopRequested: The operator asked the run to stop.
-    """
-    deadline_s = time.monotonic() + timeout_s
-    while True:
-        clock.check()
-        left_s = max(0.0, deadline_s - time.monotonic())
-        received = poll(min(left_s, SLICE_S))
-        if received is not None:
-            return received
-        if left_s == 0.0:
-            break
-    if clock.virtual:
-        clock.sleep(timeout_s)
-    return None
+from labseq.roles import Emergency
 
 
 def port_identities(port: str) -> tuple[str, ...]:

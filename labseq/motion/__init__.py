@@ -14,7 +14,6 @@ from labseq.motion.axes import (
     fit_comb,
 )
 from labseq.motion.check import RULES, check_plan
-from labseq.motion.hold import all_on_program, cross_offsets_m, hold_program, hold_time_s
 from labseq.motion.rendering import Renderer, RenderPath, comb_sample_rate, render, render_address
 from labseq.motion.survival import Survival, choose_plan, predict_survival
 from labseq.motion.tones import fitting_batches, tone_program
@@ -26,17 +25,13 @@ __all__ = [
     "RenderPath",
     "Renderer",
     "Survival",
-    "all_on_program",
     "check_plan",
     "choose_plan",
     "comb_sample_rate",
     "correct_overlay",
-    "cross_offsets_m",
     "drive",
     "fit_comb",
     "fitting_batches",
-    "hold_program",
-    "hold_time_s",
     "predict_survival",
     "render",
     "render_address",

@@ -5,15 +5,3 @@ those that the profile names, those of ``--plugins`` and those of LABSEQ_PLUGIN_
 ``./plugins`` is only searched for a plugin that a message can advise. A plugin that fails to load does not
 affect the others: it is reported, and is an error only if a sequence or profile uses it.
 """
-
-from labseq.plugins.calls import LOCAL_PACKAGE, call_plugin
-from labseq.plugins.host import ENTRY_POINT_GROUP, PluginHost, PluginInfo, plugin_files
-
-__all__ = [
-    "ENTRY_POINT_GROUP",
-    "LOCAL_PACKAGE",
-    "PluginHost",
-    "PluginInfo",
-    "call_plugin",
-    "plugin_files",
-]

@@ -22,6 +22,9 @@ from labseq.processes import Process
 from labseq.recording import schema
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, STATE_FILE
 
+SCANNER: Final = "scanner"
+"""Key in the record of an adaptive scan (and no other): the scanner and its settings."""
+
 STATUSES: Final = ("running", "complete", "stopped", "failed")
 
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from labseq import realtime
 from labseq.assembly.lab import WARM_S
-from labseq.assembly.plugin_choice import DryRun, check_dry_run
+from labseq.assembly.options import DryRun, check_dry_run
 from labseq.assembly.profile import resolve_profile
 from labseq.config.addresses import profile_overrides
 from labseq.errors import DeviceError, LabseqError, StopRequested

@@ -27,7 +27,7 @@ from labseq.console.output import say, write_text
 from labseq.errors import ConfigError, Problem
 from labseq.files import PLUGINS, packaged_profiles_dir
 from labseq.messages import clean, did_you_mean, install_hint, listing, visible
-from labseq.plugins import PluginHost
+from labseq.plugins.host import PluginHost
 from labseq.registry import Registry
 from labseq.roles import ROLES
 from labseq.scaffold.schemas import (

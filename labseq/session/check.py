@@ -17,7 +17,7 @@ import numpy as np
 from labseq.assembly.assemble import Assembly
 from labseq.assembly.lab import WARM_S
 from labseq.assembly.plugin_choice import changed_settings
-from labseq.assembly.points import Point
+from labseq.assembly.point import Point
 from labseq.assembly.wiring import unsuitable_exposures
 from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, ProblemCollector, one_of
 from labseq.guard import Guard

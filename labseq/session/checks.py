@@ -6,19 +6,20 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from labseq.assembly.policies import missing_quantity
 from labseq.config.sequence import CheckSettings
-from labseq.data.columns import quantities_in
-from labseq.data.quantities import make_quantity
 from labseq.data.shot import Shot, caching_loader
 from labseq.errors import CheckFailedError
 from labseq.model import TargetPattern
 from labseq.recording.index import IndexRow
 from labseq.recording.results import PREFIX
 from labseq.session.analysis_processes import AnalysisProcesses
+
+if TYPE_CHECKING:
+    from labseq.data.quantities import Quantity
 
 
 class Checks:
@@ -45,8 +46,7 @@ class Checks:
         warn: Callable[[str], None],
     ) -> None:
         self._checks = [
-            (check, make_quantity(check.value, target, analyses.values), deque[float](maxlen=check.shots))
-            for check in checks
+            (check, _quantity(check, target, analyses), deque[float](maxlen=check.shots)) for check in checks
         ]
         self._run_dir = run_dir
         self._analyses = analyses
@@ -90,13 +90,26 @@ class Checks:
             value = quantity.of_shot(shot)
             if math.isnan(value) and check.value in self._unseen:  # its name may be misspelt
                 self._unseen.discard(check.value)
-                self._warn(missing_quantity(row.shot, check.value, "to check", quantities_in(row)))
+                self._warn(_missing(check, row))
             values.append(value)
             if message := _failure(check, values):
                 broken.append((check, message))
                 values.clear()  # the next message comes after as many shots again
         self._unseen.clear()
         return broken
+
+
+def _quantity(check: CheckSettings, target: TargetPattern, analyses: AnalysisProcesses) -> Quantity:
+    from labseq.data.quantities import make_quantity  # a run without checks does not need it
+
+    return make_quantity(check.value, target, analyses.values)
+
+
+def _missing(check: CheckSettings, row: IndexRow) -> str:
+    from labseq.assembly.quantities import missing_quantity
+    from labseq.data.columns import quantities_in
+
+    return missing_quantity(row.shot, check.value, "to check", quantities_in(row))
 
 
 def _failure(check: CheckSettings, values: deque[float]) -> str:

@@ -10,7 +10,7 @@ from labseq.errors import DeviceTimeoutError, LabseqError
 from labseq.guard import Guard
 from labseq.messages import format_error
 from labseq.model import CycleRecord, ShotRecord, StageTiming
-from labseq.plugins import PluginHost
+from labseq.plugins.host import PluginHost
 from labseq.roles import RunObserver
 
 _QUIET: Final = frozenset({"image", "cycle", "state", "compiling", "compiled", "run_finished"})

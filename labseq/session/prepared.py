@@ -1,20 +1,117 @@
-"""A run before its devices are opened: what `labseq check` looks at, and what a session then carries out."""
+"""A run before its devices are opened, as `labseq check` and a session use it: its shots and their points."""
 
 from __future__ import annotations
 
 import secrets
-from collections.abc import Collection
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Protocol
 
 from labseq.assembly.assemble import Assembly
 from labseq.assembly.lab import build_lab, clock_for, warm
-from labseq.assembly.points import Point
-from labseq.data import Run
+from labseq.assembly.point import Point
+from labseq.data import Run, Shot
+from labseq.data.shot import caching_loader
 from labseq.guard import StopFlag
+from labseq.recording.index import IndexRow
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab
 from labseq.session.analysis_processes import AnalysisProcesses
 from labseq.session.observers import Observers
-from labseq.session.scan import History, ListedPoints, Points, SearchedPoints
+
+
+class History:
+    """The shots of a run: those that were taken or given up, and those still to take.
+
+    Args:
+        run: The run before it was resumed; None for a new one.
+        done: Its shots that are not taken again.
+
+    Attributes:
+        point_of_shot: Number of the point of each shot of the run.
+        to_take: Shots still to take, in order.
+        last: The shot added last; None before the first one of this process.
+        shots: Number of a point -> index of a shot -> the shots taken there that count; of an adaptive scan.
+        given_up: Number of a point -> a shot that was given up there; likewise.
+    """
+
+    def __init__(
+        self, assembly: Assembly, seed: int, run: Run | None = None, done: Collection[int] = ()
+    ) -> None:
+        self.point_of_shot = assembly.point_of_shot(seed)
+        self.to_take = [shot for shot in range(len(self.point_of_shot)) if shot not in done]
+        self.last: int | None = None
+        self.shots = defaultdict[int, dict[int, Shot]](dict)
+        self.given_up: dict[int, IndexRow] = {}
+        self._is_scan, self._is_search = assembly.scanned is not None, assembly.search is not None
+        self._load = caching_loader()
+        if run is not None and self._is_search:
+            for shot in run.shots:
+                self.shots[self.point_of_shot[shot.index]][shot.index] = shot
+            skipped = (attempt for attempt in run.attempts if attempt.index in run.skipped)
+            self.given_up = {self.point_of_shot[attempt.index]: attempt.row for attempt in skipped}
+
+    @property
+    def next_number(self) -> int | None:
+        """Number of the point of the next shot; None if no shot is left."""
+        return self.point_of_shot[self.to_take[0]] if self.to_take else None
+
+    def add(self, run_dir: Path, row: IndexRow) -> None:
+        """Add the next shot, which was taken or given up."""
+        self.last = row.shot
+        self.to_take.remove(row.shot)
+        if not self._is_search:  # nothing depends on the lines; those of a long run would fill the memory
+            return
+        number = self.point_of_shot[row.shot]
+        if row.counts:
+            self.shots[number][row.shot] = Shot(run_dir, row, self._load)
+        else:
+            self.given_up[number] = row
+
+    def skip(self, shots: Sequence[int]) -> None:
+        """Do not take these shots."""
+        skipped = {*shots}
+        self.to_take = [shot for shot in self.to_take if shot not in skipped]
+
+    def later_at_its_point(self, shot: int) -> list[int]:
+        """Shots still to take at the point of a shot; none without a scan, where each shot is separate."""
+        number = self.point_of_shot[shot]
+        is_there = (later for later in self.to_take if later > shot and self.point_of_shot[later] == number)
+        return [*is_there] if self._is_scan else []
+
+
+class Points(Protocol):
+    """Says where the shots of a run are taken."""
+
+    def next(self, history: History) -> Point | None:
+        """The point of the next shot, the same object for following shots of a point; None to end the run.
+
+        Raises:
+            DeviceError: A scanner failed.
+            StopRequested: The operator asked to stop.
+        """
+        ...
+
+    def known(self, history: History) -> Mapping[int, Point]:
+        """The points that can be checked before the run: number -> point."""
+        ...
+
+
+class ListedPoints:
+    """Points that are known in advance; without a scan, the settings of the files."""
+
+    def __init__(self, assembly: Assembly) -> None:
+        self._at = cache(assembly.at)  # the same object for the same point, so that nothing is built again
+
+    def next(self, history: History) -> Point | None:
+        """The point of the next shot; None after the last one."""
+        return None if history.next_number is None else self._at(history.next_number)
+
+    def known(self, history: History) -> Mapping[int, Point]:
+        """The points of the run."""
+        return {number: self._at(number) for number in dict.fromkeys(history.point_of_shot)}
 
 
 class PreparedRun:
@@ -52,8 +149,11 @@ class PreparedRun:
         self.observers = Observers(assembly.hardware.host, observer)
         self.analyses = self._analysis_processes(run)
         self.history = History(assembly, self.seed, run, done)
-        search = assembly.search
-        self.points: Points = ListedPoints(assembly) if search is None else SearchedPoints(self, search)
+        self.points: Points = ListedPoints(assembly)
+        if assembly.search is not None:
+            from labseq.session.adaptive import SearchedPoints  # loads what other runs do not need
+
+            self.points = SearchedPoints(self, assembly.search)
         self._is_paced = paced
 
     def build_lab(self, point: Point | None = None) -> Lab:

@@ -14,7 +14,6 @@ from labseq.assembly.assemble import Assembly, assemble_recorded
 from labseq.assembly.options import Options
 from labseq.assembly.recorded import files_of
 from labseq.data import Run, open_run
-from labseq.data.points import SCANNER
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import LineLog, explained
 from labseq.guard import StopFlag
@@ -25,7 +24,7 @@ from labseq.processes import Lock, knows_no_locks
 from labseq.recording import RunWriter
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, RUN_FILE, find_run
 from labseq.recording.index import IndexRow
-from labseq.recording.run_file import encode_run, read_owner, read_run, read_state
+from labseq.recording.run_file import SCANNER, encode_run, read_owner, read_run, read_state
 from labseq.session.provenance import run_record
 from labseq.text_files import decode, read_bytes
 

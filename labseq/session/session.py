@@ -12,11 +12,9 @@ from typing import TYPE_CHECKING, Any, ParamSpec, Self
 
 from labseq.assembly.assemble import Assembly, assemble
 from labseq.assembly.lab import rebuild_lab
-from labseq.assembly.options import Options, path_of
-from labseq.assembly.plugin_choice import DryRun
-from labseq.assembly.points import Point
+from labseq.assembly.options import DryRun, Options, path_of
+from labseq.assembly.point import Point
 from labseq.data import Run, open_run
-from labseq.data.best import best_point
 from labseq.errors import ConfigError, DeviceError, RecordingError
 from labseq.guard import stop_on_signals
 from labseq.messages import error_text, visible
@@ -393,6 +391,8 @@ class Session(PreparedRun):
 
     def _report_best(self, run_dir: Path) -> None:
         """Record the best point of an adaptive scan, with its value and the suggested one."""
+        from labseq.data.best import best_point  # only adaptive scans have one
+
         best = best_point(open_run(run_dir))
         if best is not None:
             self.observers.event("scan_result", best.as_json())

@@ -20,13 +20,14 @@ from labseq.console.events import event_text, point_of_shot
 from labseq.console.text import age_text, percent, plural, size_text
 from labseq.data import Shot, open_run
 from labseq.data.follower import Event
-from labseq.data.points import SCANNER, ScanPoint
+from labseq.data.points import ScanPoint
 from labseq.errors import LabseqError, RecordingError
 from labseq.model import StageTiming
 from labseq.model.estimate import Rate, mean
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.plain import now
 from labseq.recording.folders import INDEX_FILE, STOP_FILE
+from labseq.recording.run_file import SCANNER
 from labseq.web.history import Columns, finite, judged_values
 from labseq.web.runs import OpenRun, profile_of, read_notes, text_of
 from labseq.web.shots import rows_of, shot_values

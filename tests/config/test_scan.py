@@ -28,9 +28,7 @@ N_REST = REST.count("\n")
 
 
 def scan_of(text: str, *fixed: Override) -> Scan:
-    scan = read_scan(Document.parse(REST + text, "s.yaml"), fixed)
-    assert scan is not None
-    return scan
+    return read_scan(Document.parse(REST + text, "s.yaml"), fixed)
 
 
 def points(scan: Scan) -> list[list[object]]:

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from labseq.drivers.serial_port import SLICE_S
+from labseq.drivers.waiting import SLICE_S
 from labseq.guard import StopFlag
 from labseq.plugin import StopRequested, wait_for
 from labseq.roles import NeverStopped

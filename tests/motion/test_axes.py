@@ -13,7 +13,8 @@ from scipy.interpolate import InterpolatedUnivariateSpline
 from labseq.errors import LimitError
 from labseq.model import MotionSpec, Plan, RfSpec, SiteGrid, ToneProgram
 from labseq.model.grid import axis_positions_m, centred_comb
-from labseq.motion import correct_overlay, drive, fit_comb, hold_program, tone_program
+from labseq.motion import correct_overlay, drive, fit_comb, tone_program
+from labseq.motion.hold import hold_program
 
 SPACING_M = 4.49e-6
 SLOPE = 1.6e6 / SPACING_M

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 
 from labseq.errors import ConfigError
-from labseq.plugins import PluginHost
+from labseq.plugins.host import PluginHost
 from labseq.scaffold.new import check_file_name, check_plugin_name, make_file, make_plugin
 
 

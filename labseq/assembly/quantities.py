@@ -1,22 +1,19 @@
-"""The policies of a sequence: retries, timeouts, and the quantities that checks and searches need."""
+"""Whether the shots of a sequence have the quantities that its checks and its adaptive scan need."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, Final
+from collections.abc import Collection, Iterable, Sequence
+from typing import Final
 
 from labseq.config.document import Document
-from labseq.config.sequence import SequenceSpec, StepSpec
+from labseq.config.sequence import SequenceSpec
 from labseq.data.columns import QUANTITIES
 from labseq.data.quantities import OF_IMAGES, quantity_problem, split_name
 from labseq.errors import Loc, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing
-from labseq.model.policies import NO_POLICY, RunPolicy, StepPolicy
 from labseq.model.records import unique_names
 from labseq.recording.results import PREFIX
 from labseq.roles import Step
-from labseq.settings import settings_of
 
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
@@ -79,55 +76,18 @@ def missing_quantity(shot: int, name: str, purpose: str, quantities: Iterable[st
     return f"shot {shot} has no '{clean(name)}' {purpose} ({hint})"
 
 
-def make_policy(
+def check_checks(
     document: Document,
     sequence: SequenceSpec,
-    steps: Sequence[tuple[str, Step]],
+    steps: Sequence[tuple[str, Step]] | None,
     results: Collection[str],
     problems: ProblemCollector,
-) -> RunPolicy:
-    """The policies of a run and its steps."""
-    own = sequence.policy
-    otherwise = StepPolicy(on_failure=own.on_failure, over_budget=own.over_budget)
-    policies = [NO_POLICY] * len(sequence.shot)
-    for number, spec in enumerate(sequence.shot):
-        with problems:
-            policies[number] = _step_policy(document, spec, otherwise)
-    is_whole = len(steps) == len(sequence.shot)
-    for number, (spec, policy) in enumerate(zip(sequence.shot, policies, strict=True)):
-        if is_whole and policy.retries and not steps[number][1].repeatable:
-            what = f"'{spec.kind}' cannot be tried again in the same shot: atoms may have moved"
-            hint = "write 'on_failure: repeat_shot'"
-            problems.add(document.error((*spec.policy_loc, "retries"), what, "0", hint, key=True))
-    for number, check in enumerate(own.checks):
+) -> None:
+    """Check the checks of a sequence; arguments as for :func:`check_quantity`."""
+    for number, check in enumerate(sequence.policy.checks):
         place = "policy", "checks", number
         with problems:
-            checked = steps if is_whole else None
-            check_quantity(document, (*place, "value"), check.value, "to check", checked, results)
+            check_quantity(document, (*place, "value"), check.value, "to check", steps, results)
         if check.then == "skip_point" and sequence.scan is None:
             what = "there is no scan whose points could be skipped"
             problems.add(document.error((*place, "then"), what, "'warn' or 'stop'"))
-    return RunPolicy(sequence.attempts, own.when_exhausted, otherwise, tuple(policies))
-
-
-def with_policies(
-    document: Document, sequence: SequenceSpec, dumps: Sequence[Mapping[str, Any]]
-) -> list[dict[str, Any]]:
-    """The settings of the steps for the record, each with its policy."""
-    steps = [dict(dumped) for dumped in dumps]
-    for spec, dumped in zip(sequence.shot, steps, strict=True):
-        if document.root.at(spec.policy_loc) is not None:
-            policy = document.validate(StepPolicy, spec.policy_loc)
-            written = document.get(spec.policy_loc) or {}
-            settings = [setting for setting in settings_of(StepPolicy) if setting.key in written]
-            dumped["policy"] = {setting.key: getattr(policy, setting.name) for setting in settings}
-    return steps
-
-
-def _step_policy(document: Document, spec: StepSpec, otherwise: StepPolicy) -> StepPolicy:
-    own = document.validate(StepPolicy, spec.policy_loc, called=f"the policy of '{spec.kind}'")
-    return replace(
-        own,
-        on_failure=own.on_failure or otherwise.on_failure,
-        over_budget=own.over_budget or otherwise.over_budget,
-    )
