@@ -11,7 +11,6 @@ frame and the moves.
 from __future__ import annotations
 
 import math
-import os
 import queue
 import signal
 import threading
@@ -219,19 +218,16 @@ class _Worker:
 
     def __init__(self, name: str) -> None:
         self._calls: queue.SimpleQueue[GuardedCall | None] = queue.SimpleQueue()
-        self._current: GuardedCall | None = None
+        self._done = threading.Event()
+        self._done.set()
         threading.Thread(target=self._loop, name=f"labseq {name}", daemon=True).start()
-
-    def forget(self) -> None:
-        """Keep nothing of the last call alive."""
-        self._current = None
 
     @property
     def busy(self) -> bool:
-        return self._current is not None and not self._current.done.is_set()
+        return not self._done.is_set()
 
     def submit(self, call: GuardedCall) -> None:
-        self._current = call
+        self._done = call.done  # not the call: nothing keeps its result alive
         self._calls.put(call)
 
     def end(self) -> None:
@@ -243,12 +239,6 @@ class _Worker:
             del call  # an idle thread keeps nothing alive
 
 
-_idle_workers: Final[dict[str, list[_Worker]]] = {}
-"""Owner -> threads for its further short calls: starting one takes longer than most of these calls."""
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_idle_workers.clear)  # a forked process has none of these threads
-
-
 class Guard:
     """Runs the calls into devices and plugins.
 
@@ -258,18 +248,16 @@ class Guard:
 
     Args:
         stop: The request to stop; without one, calls are never stopped.
-        reuses_threads: Whether the threads of an owner may have served other guards before, and may do so
-            later. Those of devices must not: vendor libraries keep a state for each thread.
 
     Attributes:
         direct: Owners whose calls a shot makes in the thread of its steps. If one of these hangs, the shot is
             abandoned.
     """
 
-    def __init__(self, stop: StopFlag | None = None, *, reuses_threads: bool = False) -> None:
+    def __init__(self, stop: StopFlag | None = None) -> None:
         self._stop = stop or StopFlag()
-        self._reuses_threads = reuses_threads
         self._workers: dict[str, _Worker] = {}
+        self._lock = threading.Lock()
         self.direct: frozenset[str] = frozenset()
 
     def call(
@@ -390,11 +378,11 @@ class Guard:
     def _submit(self, owner: str, call: GuardedCall) -> bool:
         """Hand a call to the owner's thread; False if it was carried out here instead."""
         try:
-            worker = self._worker(owner)
+            with self._lock:
+                self._worker(owner).submit(call)
         except (RuntimeError, MemoryError):  # no thread can be started: better no limit than no call
             call.run()
             return False
-        worker.submit(call)
         return True
 
     def _wait(
@@ -423,27 +411,19 @@ class Guard:
         return call
 
     def end(self) -> None:
-        """End the idle threads; one that hangs is left to the end of the process."""
-        for owner, worker in self._workers.items():
-            if self._reuses_threads and not worker.busy:
-                worker.forget()
-                _idle_workers.setdefault(owner, []).append(worker)
-            else:
+        """End the idle threads, and each other one as soon as its call returns."""
+        with self._lock:
+            for worker in self._workers.values():
                 worker.end()
-        self._workers.clear()
+            self._workers.clear()
 
     def _worker(self, owner: str) -> _Worker:
         worker = self._workers.get(owner)
-        if worker is not None and worker.busy:
-            worker.end()  # its call hangs
-            worker = None
-        if worker is None:
-            idle = _idle_workers.get(owner, []) if self._reuses_threads else []
-            try:
-                worker = idle.pop()
-            except IndexError:  # another thread may have taken the last
-                worker = _Worker(owner)
-            self._workers[owner] = worker
+        if worker is not None and not worker.busy:
+            return worker
+        if worker is not None:
+            worker.end()  # its call hangs, or is another thread's: no further ones follow it
+        worker = self._workers[owner] = _Worker(owner)
         return worker
 
     def _call(self, owner: str, timeout_s: float, grace_s: float, work: partial[T]) -> T:

@@ -199,14 +199,10 @@ def test_an_error_of_a_direct_call_is_named(guard):
         guard.run_shot(partial(guard.call, "detector", 10.0, detect))
 
 
-def test_a_thread_serves_its_owner_again_unless_it_hangs():
+def test_a_thread_serves_its_owner_again_unless_it_hangs(guard):
     def serve(owner, work):
-        guard = Guard(reuses_threads=True)
-        try:
-            call = guard.run(owner, 0.05, partial(work))
-            return None if call is None else call.result
-        finally:
-            guard.end()
+        call = guard.run(owner, 0.05, partial(work))
+        return None if call is None else call.result
 
     first, again, other = (serve(f"plugin {name}", threading.current_thread) for name in "aab")
     assert first is again

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 import traceback
 from collections.abc import Callable
@@ -27,6 +28,20 @@ LOCAL_PACKAGE: Final = "labseq_local"
 """Package of the modules of plugins from folders."""
 
 
+_guard = Guard()
+"""Its threads, one for each plugin, stay: starting one takes longer than most calls."""
+
+
+def _renew_guard() -> None:
+    """A forked process has none of these threads."""
+    global _guard  # noqa: PLW0603 - a guard is no constant, but there is one in a process
+    _guard = Guard()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew_guard)
+
+
 def call_plugin(owner: Owner, code_name: str, work: Callable[[], T]) -> T:
     """Run code of a plugin, and name the plugin in any error.
 
@@ -44,17 +59,17 @@ def call_plugin(owner: Owner, code_name: str, work: Callable[[], T]) -> T:
         PluginLoadError: The code raised, or did not return in time.
         LabseqError: The code raised one of labseq's own errors.
     """
-    guard, printed = Guard(reuses_threads=True), _PrintsToStderr(sys.stdout)
+    printed = _PrintsToStderr(sys.stdout)
     try:
         with redirect_stdout(cast("Any", printed)):
-            call = guard.run(f"plugin {owner.name}", owner.max_wait_s, partial(work))
+            call = _guard.run(f"plugin {owner.name}", owner.max_wait_s, partial(work))
     finally:
-        guard.end()
         if text := printed.end():
             when = f"in {code_name}" if code_name else "while it was loaded"
             advice = "this went to stderr: use 'logging.getLogger(__name__)'"
             owner.note(f"{when} it printed ('{text[:MAX_PRINTED]}'); {advice}")
     if call is None:
+        _guard.end()  # so that its thread does, too, should the call ever return
         fault = f"{code_name} did not return" if code_name else "it did not finish loading"
         remedy = "if it is only slow, raise 'timeouts: {load: ...}' in the profile"
         raise owner.fault(f"{fault} within {owner.max_wait_s:.3g} s and was abandoned; {remedy}")

@@ -55,7 +55,7 @@ class RunWriter:
 
     def __init__(self, run_dir: Path, run: RunRecord, stop: StopFlag | None = None) -> None:
         self.run_dir = run_dir
-        self._guard = Guard(stop, reuses_threads=True)
+        self._guard = Guard(stop)
         self.is_given_up = False
         self.n_written = 0
         self._last_row: IndexRow | None = None

@@ -171,6 +171,9 @@ def refusal(
     raise AssertionError(f"{what} was accepted; expected {wanted}")
 
 
+_guard = Guard()  # for all calls: to start a thread takes longer than most of them
+
+
 def in_time(limit_s: float, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
     """Make a call that must return.
 
@@ -178,12 +181,9 @@ def in_time(limit_s: float, what: str, call: Callable[P, T], *args: P.args, **kw
         CallHungError: It has not returned after ``limit_s`` of real time.
     """
     __tracebackhide__ = True
-    guard = Guard(reuses_threads=True)  # to start a thread takes longer than most of these calls
-    try:
-        done = guard.run("test of a contract", limit_s, partial(Context().run, call, *args, **kwargs))
-    finally:
-        guard.end()
+    done = _guard.run("test of a contract", limit_s, partial(Context().run, call, *args, **kwargs))
     if done is None:
+        _guard.end()
         raise CallHungError(f"{what} has not returned after {limit_s:g} s")
     if done.error is not None:
         raise done.error
