@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from labseq.assembly.options import NOT_SET, DryRun, Options
+from labseq.assembly.options import DryRun, Options
 from labseq.assembly.plugin_choice import (
     ChosenPlugin,
     construct_one,
@@ -19,37 +19,22 @@ from labseq.assembly.plugin_choice import (
 )
 from labseq.assembly.point import Point, make_step, place_note
 from labseq.assembly.profile import ResolvedProfile, resolve_profile
-from labseq.config.addresses import PROFILE, PROFILE_ROLES, find, split_overrides
+from labseq.config.addresses import PROFILE_ROLES, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_sequence
 from labseq.config.sequence import SequenceSpec, StepSpec, load_sequence
-from labseq.errors import ConfigError, LabseqError, Loc, PluginLoadError, ProblemCollector
+from labseq.errors import ConfigError, LabseqError, PluginLoadError, ProblemCollector
 from labseq.model import TargetPattern
 from labseq.model.policies import NO_POLICY, RunPolicy, StepPolicy
 from labseq.recording.results import PREFIX
 from labseq.roles import Context, Step
-from labseq.settings import settings_of, si_unit_at
-from labseq.units import si_unit_of
+from labseq.settings import settings_of
 
 if TYPE_CHECKING:
     from labseq.assembly.points import ScanPoints
     from labseq.assembly.recorded import RecordedFiles
     from labseq.assembly.search import Search
     from labseq.config.scan import Scan
-
-
-class Setting(NamedTuple):
-    """A value as it is recorded.
-
-    Attributes:
-        value: SI, JSON-ready.
-        unit: SI unit; "" for none.
-        written: As it was typed.
-    """
-
-    value: Any
-    unit: str
-    written: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,42 +75,6 @@ class Assembly:
     def virtual_time(self) -> bool:
         """Whether the run's clock is virtual, without real waiting times."""
         return self.hardware.virtual_time
-
-    def setting(self, address: str, written: str = "") -> Setting:
-        """A setting of the run, after defaults and overrides; the scan is at its first point.
-
-        Args:
-            address: Its address; "profile." for one in the profile.
-            written: What was typed for it: taken if the record has no such setting.
-        """
-        if address in NOT_SET:
-            return Setting(written, "", written)
-        of_profile = address.startswith(PROFILE)
-        document = self.hardware.document if of_profile else self.document
-        try:
-            loc = find(document.root, address.removeprefix(PROFILE) if of_profile else address)
-            value: Any = self.resolved["profile"] if of_profile else self.resolved
-            for key in loc:
-                value = value[key]
-        except (ConfigError, LookupError, TypeError):  # a setting that is written and not used
-            return Setting(written, "", written)
-        return Setting(value, self._unit(of_profile, loc) or si_unit_of(written), written)
-
-    def _unit(self, of_profile: bool, loc: Loc) -> str:
-        """SI unit of a setting of a plugin or of the core; "" if it has none."""
-        registry, top = self.hardware.host.registry, loc[0]
-        entry, core, n = None, type(self.hardware.profile if of_profile else self.sequence), 1
-        if of_profile:
-            n = 2 if top == "devices" else 1
-            chosen = self.hardware.chosen.get(str(loc[n - 1])) if len(loc) >= n else None
-            entry = chosen and chosen.entry
-        elif top == "planner":
-            entry = self.planner.entry
-        elif top == "target" and self.sequence.target is not None:
-            entry = registry.find("pattern", self.sequence.target.use)
-        elif top == "shot" and len(loc) > 2:
-            entry, n = registry.find("step", str(loc[2])), 3
-        return (entry and si_unit_at(entry.settings_model, loc[n:])) or si_unit_at(core, loc)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -199,6 +148,7 @@ def assemble(
         )
     except ConfigError as error:
         raise problems.stop(error) from None
+    # at the points of a scan, the errors of the files would be found again
     scan = None if problems.problems else scan
     try:
         hardware = resolve_profile(
@@ -391,8 +341,8 @@ def make_policy(
     problems: ProblemCollector,
 ) -> RunPolicy:
     """The policies of a run and its steps."""
-    own = sequence.policy
-    otherwise = StepPolicy(on_failure=own.on_failure, over_budget=own.over_budget)
+    settings = sequence.policy
+    otherwise = StepPolicy(on_failure=settings.on_failure, over_budget=settings.over_budget)
     policies = [NO_POLICY] * len(sequence.shot)
     for number, spec in enumerate(sequence.shot):
         with problems:
@@ -403,11 +353,11 @@ def make_policy(
             what = f"'{spec.kind}' cannot be tried again in the same shot: atoms may have moved"
             hint = "write 'on_failure: repeat_shot'"
             problems.add(document.error((*spec.policy_loc, "retries"), what, "0", hint, key=True))
-    if own.checks:
+    if settings.checks:
         from labseq.assembly.quantities import check_checks  # loads what a run without checks does not need
 
         check_checks(document, sequence, steps if is_whole else None, results, problems)
-    return RunPolicy(sequence.attempts, own.when_exhausted, otherwise, tuple(policies))
+    return RunPolicy(sequence.attempts, settings.when_exhausted, otherwise, tuple(policies))
 
 
 def with_policies(
@@ -425,11 +375,11 @@ def with_policies(
 
 
 def _step_policy(document: Document, spec: StepSpec, otherwise: StepPolicy) -> StepPolicy:
-    own = document.validate(StepPolicy, spec.policy_loc, called=f"the policy of '{spec.kind}'")
+    policy = document.validate(StepPolicy, spec.policy_loc, called=f"the policy of '{spec.kind}'")
     return replace(
-        own,
-        on_failure=own.on_failure or otherwise.on_failure,
-        over_budget=own.over_budget or otherwise.over_budget,
+        policy,
+        on_failure=policy.on_failure or otherwise.on_failure,
+        over_budget=policy.over_budget or otherwise.over_budget,
     )
 
 

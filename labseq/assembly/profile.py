@@ -107,18 +107,18 @@ class ResolvedProfile:
             if document.get(loc) == self.document.get(loc):
                 continue
             with problems:
-                own = document.validate(type(choice), loc).placed(*loc)
+                new_choice = document.validate(type(choice), loc).placed(*loc)
                 is_hardware = chosen[role].entry.role.is_hardware
-                if is_hardware and own.use != choice.use:
+                if is_hardware and new_choice.use != choice.use:
                     what = f"a scan cannot change the driver of {role}"
                     raise document.error((*loc, "use"), what, "one driver for the whole run")
-                one, _ = choose(self.host, document, profile, role, own, self.dry_run)
-                if is_hardware and one.virtual_time != chosen[role].virtual_time:
+                plugin, _ = choose(self.host, document, profile, role, new_choice, self.dry_run)
+                if is_hardware and plugin.virtual_time != chosen[role].virtual_time:
                     what = f"the scan would change whether {role} is simulated"
                     raise document.error(loc, what, "all points simulated, or none")
-                chosen[role] = one
-                if isinstance(own, MobileTweezersChoice):
-                    profile = profile.model_copy(update={"mobile_tweezers": own})
+                chosen[role] = plugin
+                if isinstance(new_choice, MobileTweezersChoice):
+                    profile = profile.model_copy(update={"mobile_tweezers": new_choice})
         problems.raise_any()
         return replace(self, document=document, profile=profile, chosen=chosen)
 
@@ -131,14 +131,14 @@ class ResolvedProfile:
     @property
     def identities(self) -> Mapping[str, str]:
         """What only one process can use of its hardware -> the role or device that uses it."""
-        hardware = {role: one for role, one in self.chosen.items() if one.entry.role.is_hardware}
-        return {identity: role for role, one in hardware.items() for identity in one.identities(role)}
+        hardware = [(role, plugin) for role, plugin in self.chosen.items() if plugin.entry.role.is_hardware]
+        return {identity: role for role, plugin in hardware for identity in plugin.identities(role)}
 
     @property
     def virtual_time(self) -> bool:
         """Whether no device needs real time, so that the clock can be virtual."""
-        hardware = [one for one in self.chosen.values() if one.entry.role.is_hardware]
-        return self.dry_run != "off" or all(one.virtual_time for one in hardware)
+        hardware = [plugin for plugin in self.chosen.values() if plugin.entry.role.is_hardware]
+        return self.dry_run != "off" or all(plugin.virtual_time for plugin in hardware)
 
 
 def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, problems: ProblemCollector) -> None:
@@ -226,7 +226,7 @@ def choose_plugins(
     warnings: list[str] = []
     refused: dict[str, ConfigError] = {}
     for role, choice in {**spec.choices, **spec.devices}.items():
-        if choice.loc in document.replaced:
+        if choice.loc in document.replaced:  # its problem is reported; what is chosen here is a fallback
             refused[role] = ConfigError("its settings in the profile are invalid")
             continue
         try:
@@ -238,14 +238,15 @@ def choose_plugins(
     check_kinds(document, spec, host, problems)
     check_dead_time(document, spec, problems)
     detector = chosen["detector"].dump() if "detector" in chosen else {}
-    made = (
+    # calibrations need not fit a grid that stands in for a wrong one
+    active = (
         ActiveCalibrations({}, spec.grid_model())
         if repaired
         else calibrated(document, spec, problems, dry_run, detector, calibrations)
     )
-    warnings += made.warnings
+    warnings += active.warnings
     return ResolvedProfile(
-        document, spec, dry_run, host, made.grid, chosen, tuple(warnings), refused, made.entries
+        document, spec, dry_run, host, active.grid, chosen, tuple(warnings), refused, active.entries
     )
 
 

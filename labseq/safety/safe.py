@@ -30,7 +30,7 @@ from labseq.messages import clean
 from labseq.model.policies import Timeouts
 from labseq.plain import now
 from labseq.processes import HANG_S, Holder, Lock, Process
-from labseq.recording import clear_active, find_dead_run, lock_file
+from labseq.recording import clear_active, lock_file
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, in_safe_order
 from labseq.safety.locks import device_text, end_holders, lock_devices
 from labseq.sequencer.clock import RealClock, VirtualClock
@@ -154,21 +154,21 @@ def make_profile_devices_safe(
     return SafeStateReport(attempted, refused)
 
 
-def make_safe_after_crash(hardware: ResolvedProfile, stop: StopFlag, observer: RunObserver) -> None:
-    """Make the devices of a profile safe if the process of their last run died, because they may still be on.
-
-    This comes first, because constructing and compiling may fail.
+def make_safe_after_crash(
+    dead: Path, hardware: ResolvedProfile, stop: StopFlag, observer: RunObserver
+) -> None:
+    """Make the devices of a profile safe after the process of their last run died: they may still be on.
 
     Args:
+        dead: The folder of that run.
+        hardware: The profile.
         stop: The request to stop; obeyed once every device has been tried.
+        observer: Receives warnings.
 
     Raises:
         LabseqError: The first device that is not safe.
         StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
-    dead = find_dead_run(hardware.key, hardware.identities)
-    if dead is None:
-        return
     text = f"the last run on these devices ({dead}) died; they are made safe first"
     observer.event("warning", {"text": text})
     for line in watchdog_lines(dead):

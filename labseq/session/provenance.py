@@ -13,21 +13,40 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import labseq
+from labseq.assembly.options import NOT_SET
 from labseq.calibration_store import encode_entry
-from labseq.errors import StopRequested
+from labseq.config.addresses import PROFILE, find
+from labseq.errors import ConfigError, Loc, StopRequested
 from labseq.messages import format_error
 from labseq.model import CalibrationEntry, RunRecord
 from labseq.model.records import RunStatus, unique_names
 from labseq.plain import now_utc
 from labseq.plugins.host import name_and_version
+from labseq.settings import si_unit_at
+from labseq.units import si_unit_of
 
 if TYPE_CHECKING:
     from labseq.assembly.assemble import Assembly
+    from labseq.registry import Entry
 
 _GIT_TIMEOUT_S: Final = 5.0
+
+
+class Setting(NamedTuple):
+    """A value as it is recorded.
+
+    Attributes:
+        value: SI, JSON-ready.
+        unit: SI unit; "" for none.
+        written: As it was typed.
+    """
+
+    value: Any
+    unit: str
+    written: str
 
 
 def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
@@ -117,9 +136,9 @@ def run_record(assembly: Assembly, seed: int, changes: Mapping[str, str], folder
         folder: The working folder, absolute: relative paths in the settings are relative to it.
     """
     spec, hardware = assembly.sequence, assembly.hardware
-    changed = {address: assembly.setting(address, text) for address, text in changes.items()}
+    changed = {address: _setting(assembly, address, text) for address, text in changes.items()}
     scanned = () if assembly.scanned is None else assembly.scanned.at(0).parameters
-    at_points = {address: assembly.setting(address) for address in scanned}
+    at_points = {address: _setting(assembly, address) for address in scanned}
     return RunRecord(
         name=spec.name,
         n_shots=spec.shots,
@@ -144,6 +163,56 @@ def run_record(assembly: Assembly, seed: int, changes: Mapping[str, str], folder
         steps=unique_names([name for name, _ in assembly.steps]),
         calibrations={kind: entry.id for kind, entry in hardware.calibrations.items()},
     )
+
+
+def _setting(assembly: Assembly, address: str, written: str = "") -> Setting:
+    """A setting of the run, after defaults and overrides; the scan is at its first point.
+
+    Args:
+        assembly: The run.
+        address: Its address; "profile." for one in the profile.
+        written: What was typed for it: taken if the record has no such setting.
+    """
+    if address in NOT_SET:
+        return Setting(written, "", written)
+    of_profile = address.startswith(PROFILE)
+    document = assembly.hardware.document if of_profile else assembly.document
+    try:
+        loc = find(document.root, address.removeprefix(PROFILE))
+        value: Any = assembly.resolved["profile"] if of_profile else assembly.resolved
+        for key in loc:
+            value = value[key]
+    except (ConfigError, LookupError, TypeError):  # a setting that is written and not used
+        return Setting(written, "", written)
+    return Setting(value, _unit(assembly, loc, of_profile=of_profile) or si_unit_of(written), written)
+
+
+def _unit(assembly: Assembly, loc: Loc, *, of_profile: bool) -> str:
+    """SI unit of a setting of a plugin or of the core; "" if it has none."""
+    core = type(assembly.hardware.profile if of_profile else assembly.sequence)
+    entry, n_keys = (_plugin_of_profile if of_profile else _plugin_of_sequence)(assembly, loc)
+    return (entry and si_unit_at(entry.settings_model, loc[n_keys:])) or si_unit_at(core, loc)
+
+
+def _plugin_of_profile(assembly: Assembly, loc: Loc) -> tuple[Entry | None, int]:
+    """The plugin that a setting of the profile belongs to, and how many keys lead to its settings."""
+    n_keys = 2 if loc[0] == "devices" else 1
+    chosen = assembly.hardware.chosen.get(str(loc[:n_keys][-1]))
+    return chosen and chosen.entry, n_keys
+
+
+def _plugin_of_sequence(assembly: Assembly, loc: Loc) -> tuple[Entry | None, int]:
+    """The same of a setting of the sequence."""
+    registry, target = assembly.hardware.host.registry, assembly.sequence.target
+    match loc:
+        case ("planner", *_):
+            return assembly.planner.entry, 1
+        case ("target", *_) if target is not None:
+            return registry.find("pattern", target.use), 1
+        case ("shot", _, kind, *_):
+            return registry.find("step", str(kind)), 3
+        case _:
+            return None, 0
 
 
 def copies(calibrations: Mapping[str, CalibrationEntry]) -> dict[str, bytes | str]:

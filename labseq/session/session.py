@@ -20,11 +20,10 @@ from labseq.guard import stop_on_signals
 from labseq.messages import error_text, visible
 from labseq.model import RunRecord
 from labseq.realtime import real_time
-from labseq.recording import RunWriter, clear_active, data_root, mark_active
+from labseq.recording import RunWriter, clear_active, data_root, find_dead_run, mark_active
 from labseq.recording.folders import later_day
 from labseq.roles import RunObserver
 from labseq.safety.locks import lock_devices
-from labseq.safety.safe import make_safe_after_crash
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer, State
 from labseq.session.check import check
@@ -260,7 +259,11 @@ class Session(PreparedRun):
             lock_devices(hardware, purpose, self.warn) as describe_locks,
             closing(self.observers),
         ):
-            make_safe_after_crash(hardware, self.stop_flag, self.observers)
+            # first of all, because constructing and compiling may fail
+            if (dead := find_dead_run(hardware.key, hardware.identities)) is not None:
+                from labseq.safety.safe import make_safe_after_crash
+
+                make_safe_after_crash(dead, hardware, self.stop_flag, self.observers)
             first = self.points.next(self.history)
             if first is None:  # its process died between the last shot and the end of the run
                 self._begin(root, first)[1].finish("complete")
