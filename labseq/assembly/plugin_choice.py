@@ -54,6 +54,7 @@ class ChosenPlugin:
         simulated = self.entry.simulated
         if self.entry.virtual_time or simulated is None or self.settings is None:
             return self.entry.virtual_time
+        # a setting that simulates the device may be written in the profile itself
         update = {key: value for key, value in simulated.items() if key != "trigger" or not self.by_line}
         return self.settings.model_copy(update=update) == self.settings
 

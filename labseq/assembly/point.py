@@ -14,12 +14,13 @@ if TYPE_CHECKING:
     from labseq.assembly.profile import ResolvedProfile
     from labseq.config.document import Document
     from labseq.config.sequence import StepSpec
+    from labseq.registry import Entry
     from labseq.roles import Step
 
 T = TypeVar("T")
 
 
-class Made(NamedTuple, Generic[T]):
+class Configured(NamedTuple, Generic[T]):
     """A planner or step, and its settings after defaults, SI, JSON-ready."""
 
     plugin: T
@@ -50,7 +51,7 @@ class Point:
         return id(self.planner), id(self.hardware)
 
 
-def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> Made[Step]:
+def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> Configured[Step]:
     """A step of a sequence, and its settings for the record.
 
     Raises:
@@ -58,30 +59,43 @@ def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> 
             names; with their place.
     """
     entry = find_entry(hardware.host, document, "step", spec.kind, spec.loc, key=True)
-    for key in {"name", "policy"} - {setting.key for setting in settings_of(entry.settings_model)}:
-        if document.root.at((*spec.loc, key)) is not None:
-            what, hint = (
-                f"'{key}' is in the settings of '{spec.kind}'",
-                f"write '{key}' on a line of its own below",
-            )
-            raise document.error((*spec.loc, key), what, f"'{key}' beside '{spec.kind}'", hint, key=True)
+    _check_indentation(document, spec, entry)
     settings = read_settings(document, entry, spec.loc)
     try:
         step, dumped = construct_role(entry, settings), dump(entry, settings)
     except (ConfigError, PluginLoadError) as error:
         raise document.error(spec.loc, str(error)) from error
-    key, devices = step.device_setting, hardware.profile.devices
-    name = getattr(settings, key, None) if key else None
-    may_be_camera = step.device_may_be_camera
-    known = [one for one, choice in devices.items() if may_be_camera or choice.role == "device"]
-    known += ["camera"] if may_be_camera else []
-    if name is not None and name not in known:
-        what = f"the profile '{hardware.profile.name}' has no device '{name}'"
-        if name in devices:
-            what = f"'{name}' is a camera, which '{spec.kind}' cannot use"
-        problem = document.problem((*spec.loc, key), what, one_of(sorted(known)))
-        raise ConfigError(replace(problem, notes=(place_note(hardware.document, "devices"),)))
-    return Made(step, dumped)
+    if step.device_setting and (name := getattr(settings, step.device_setting, None)) is not None:
+        _check_device(hardware, document, spec, step, name)
+    return Configured(step, dumped)
+
+
+def _check_indentation(document: Document, spec: StepSpec, entry: Entry) -> None:
+    """Raise for keys of the item of the list that are indented as settings of the step are."""
+    settings = {setting.key for setting in settings_of(entry.settings_model)}
+    for key in ("name", "policy"):
+        if key not in settings and document.root.at((*spec.loc, key)) is not None:
+            what = f"'{key}' is in the settings of '{spec.kind}'"
+            hint = f"write '{key}' on a line of its own below"
+            raise document.error((*spec.loc, key), what, f"'{key}' beside '{spec.kind}'", hint, key=True)
+
+
+def _check_device(
+    hardware: ResolvedProfile, document: Document, spec: StepSpec, step: Step, name: str
+) -> None:
+    """Raise if the profile lacks the device that a step names, or if the step cannot use it."""
+    devices = hardware.profile.devices
+    if step.device_may_be_camera:
+        known = ["camera", *devices]
+    else:
+        known = [device for device, choice in devices.items() if choice.role == "device"]
+    if name in known:
+        return
+    what = f"the profile '{hardware.profile.name}' has no device '{name}'"
+    if name in devices:
+        what = f"'{name}' is a camera, which '{spec.kind}' cannot use"
+    problem = document.problem((*spec.loc, step.device_setting), what, one_of(sorted(known)))
+    raise ConfigError(replace(problem, notes=(place_note(hardware.document, "devices"),)))
 
 
 def place_note(document: Document, key: str) -> str:

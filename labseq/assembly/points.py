@@ -14,7 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from labseq.assembly.plugin_choice import resolve
-from labseq.assembly.point import Made, Point, make_step
+from labseq.assembly.point import Configured, Point, make_step
 from labseq.config.addresses import PROFILE, PROFILE_ROLES, VARIABLES
 from labseq.config.scan import Axis, Scan, put
 from labseq.errors import ConfigError, Loc, ProblemCollector
@@ -63,6 +63,7 @@ class ScanPoints:
         except ConfigError as error:
             problems.add(error)
             return
+        # at each point, the errors that are there anyway would come once more
         known = set(self.scan.explained(ConfigError(problems.problems)).problems)
         n_before = len(problems.problems)
         for number in range(math.prod(self.scan.shape)):
@@ -89,16 +90,16 @@ class ScanPoints:
         Raises:
             ConfigError: All that plugins refuse of the values.
         """
-        problems, hardware, made = ProblemCollector(), self.hardware, dict[Loc, Made[Any]]()
+        problems, hardware, plugins = ProblemCollector(), self.hardware, dict[Loc, Configured[Any]]()
         document = put(values, self.document, profile=False)
         with problems:
             hardware = self._profile_with(values)
         with problems:
-            made = self._planner_and_steps(document)
+            plugins = self._planner_and_steps(document)
         problems.raise_any()
         parameters: dict[str, Any] = {}
         for axis, node in values:
-            value = _setting(made, hardware, axis.of_profile, axis.loc)
+            value = _setting(plugins, hardware, axis.of_profile, axis.loc)
             if axis.loc[0] == VARIABLES:
                 value = _si(node.plain())
             elif value is None or isinstance(node.value, dict):
@@ -107,9 +108,9 @@ class ScanPoints:
         for axis, _ in values:
             for loc in self._dependents(axis):
                 address = _address(axis.of_profile, loc)
-                parameters[address] = _setting(made, hardware, axis.of_profile, loc)
-        steps = tuple((spec.name or spec.kind, made[spec.loc].plugin) for spec in self.sequence.shot)
-        return Point(made[_PLANNER].plugin, steps, hardware, parameters, document)
+                parameters[address] = _setting(plugins, hardware, axis.of_profile, loc)
+        steps = tuple((spec.name or spec.kind, plugins[spec.loc].plugin) for spec in self.sequence.shot)
+        return Point(plugins[_PLANNER].plugin, steps, hardware, parameters, document)
 
     def record(self, point_of_shot: Sequence[int]) -> dict[str, Any]:
         """The scan for the run's record, JSON-ready.
@@ -134,19 +135,19 @@ class ScanPoints:
             return _si((self.hardware.document if axis.of_profile else self.document).get(axis.loc))
         return _setting(self._planner_and_steps(self.document), self.hardware, axis.of_profile, axis.loc)
 
-    def _planner_and_steps(self, document: Document) -> dict[Loc, Made[Any]]:
+    def _planner_and_steps(self, document: Document) -> dict[Loc, Configured[Any]]:
         """Planner and steps by the place of their settings.
 
         Raises:
             ConfigError: All that they refuse.
         """
-        problems, made = ProblemCollector(), dict[Loc, Made[Any]]()
+        problems, plugins = ProblemCollector(), dict[Loc, Configured[Any]]()
         for loc in (_PLANNER, *(spec.loc for spec in self.sequence.shot)):
             with problems:
-                key = loc, json.dumps(document.get(loc))
-                made[loc] = self._once(key, partial(self._make, document, loc))
+                key = loc, json.dumps(document.get(loc))  # as text: settings are mappings, which are not keys
+                plugins[loc] = self._once(key, partial(self._make, document, loc))
         problems.raise_any()
-        return made
+        return plugins
 
     def _profile_with(self, values: Sequence[tuple[Axis, Node]]) -> ResolvedProfile:
         """The profile with the values of a point; points with the same values share one object."""
@@ -159,11 +160,11 @@ class ScanPoints:
 
         return self._once(json.dumps(own), change)
 
-    def _make(self, document: Document, loc: Loc) -> Made[Any]:
+    def _make(self, document: Document, loc: Loc) -> Configured[Any]:
         if loc == _PLANNER:
             choice = document.validate(Choice, loc).placed(*loc)
             chosen = resolve(self.hardware.host, document, "planner", choice)
-            return Made(chosen, chosen.dump())
+            return Configured(chosen, chosen.dump())
         return make_step(self.hardware, document, self.sequence.shot[int(loc[1])])
 
     def _once(self, key: object, make: Callable[[], T]) -> T:
@@ -171,7 +172,7 @@ class ScanPoints:
         if key not in self._known:
             try:
                 self._known[key] = make()
-            except ConfigError as error:
+            except ConfigError as error:  # kept, too: many points may share a wrong value
                 self._known[key] = error
         if isinstance(self._known[key], ConfigError):
             raise self._known[key]
@@ -208,12 +209,14 @@ def _address(of_profile: bool, loc: Loc) -> str:
     return (PROFILE if of_profile else "") + ".".join(map(str, loc))
 
 
-def _setting(made: Mapping[Loc, Made[Any]], hardware: ResolvedProfile, of_profile: bool, loc: Loc) -> Any:
+def _setting(
+    plugins: Mapping[Loc, Configured[Any]], hardware: ResolvedProfile, of_profile: bool, loc: Loc
+) -> Any:
     """The value at a location after the plugin's validation, SI; None if it is missing."""
     if loc[0] == VARIABLES:
         return None
     n = 2 if loc[0] == "devices" else 3 if loc[0] == "shot" else 1
-    value: Any = hardware.dump(str(loc[n - 1])) if of_profile else made[loc[:n]].dump
+    value: Any = hardware.dump(str(loc[n - 1])) if of_profile else plugins[loc[:n]].dump
     for step in loc[n:]:
         try:
             value = value[step]

@@ -43,24 +43,26 @@ def check_quantity(
     Raises:
         ConfigError: No shot can have it.
     """
-    names = unique_names([name for name, _ in steps or ()])
-    images = [name for name, (_, step) in zip(names, steps or (), strict=True) if step.takes_image]
-    known = [*QUANTITIES, *(name for name in results if not name.endswith("."))]
-    unforeseen = (*_UNFORESEEN, *(name for name in results if name.endswith(".")))
-    problem = quantity_problem(name, known, images, unforeseen)
+    names = unique_names([step_name for step_name, _ in steps or ()])
+    images = [image for image, (_, step) in zip(names, steps or (), strict=True) if step.takes_image]
+    unforeseen = [result for result in results if result.endswith(".")]
+    known = [*QUANTITIES, *(result for result in results if result not in unforeseen)]
+    problem = quantity_problem(name, known, images, (*_UNFORESEEN, *unforeseen))
     if problem is not None:
         what, expected, hint = problem
-        analysis = name.removeprefix(PREFIX).split(".")[0]
-        if name.startswith(PREFIX) and not any(one.startswith(f"{PREFIX}{analysis}.") for one in results):
-            hint = f"the sequence must list the analysis: 'analysis: [{{use: {clean(analysis)}}}]'"
-        raise document.error(place, f"{what} {purpose}", expected, hint)
-    if (
-        (name in _JUDGED or split_name(name)[0] in OF_IMAGES)
-        and steps is not None
-        and not any(step.takes_image for _, step in steps)
-    ):
+        raise document.error(place, f"{what} {purpose}", expected, _analysis_hint(name, results) or hint)
+    needs_image = name in _JUDGED or split_name(name)[0] in OF_IMAGES
+    if needs_image and steps is not None and not images:
         what = f"no shot has a {name}: it takes no image"
         raise document.error(place, what, "an 'image' step in the shot, or another quantity")
+
+
+def _analysis_hint(name: str, results: Iterable[str]) -> str:
+    """How to get the result of an analysis that the sequence does not list; "" for other names."""
+    analysis = name.removeprefix(PREFIX).split(".")[0]
+    if not name.startswith(PREFIX) or any(result.startswith(f"{PREFIX}{analysis}.") for result in results):
+        return ""
+    return f"the sequence must list the analysis: 'analysis: [{{use: {clean(analysis)}}}]'"
 
 
 def missing_quantity(shot: int, name: str, purpose: str, quantities: Iterable[str]) -> str:

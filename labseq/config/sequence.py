@@ -244,6 +244,7 @@ def load_sequence(
     document = Document.read(path, kept)
     check_kind(document, "sequence")
     if document.data.get("planner") is None:
+        # as an override, so that a message about it names no place in the file
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
     with collecting(problems) as collector:
         document = document.override_all(overrides, collector, may_add=("policy",)).evaluated()

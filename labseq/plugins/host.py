@@ -330,7 +330,7 @@ class PluginHost:
         entry = self.registry.find(kind, name)
         if entry is None:
             raise self._unknown(kind, name, file)
-        self._used.add(entry.origin)
+        self._used.add(entry.origin)  # only of plugins in use, a note says what they printed
         return entry
 
     def _unknown(self, kind: str, name: str, file: Path | None) -> LabseqError:
