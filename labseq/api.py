@@ -119,7 +119,7 @@ def tone_program(
         [84800000.0]
     """
     if profile is not None:
-        document, spec = load_profile(profile, beside=Path())
+        document, spec = load_profile(profile)
         profile_grid, profile_motion = calibrated_machine(document, spec)
         grid, motion = grid or profile_grid, motion or profile_motion
     return _motion.tone_program(plan, grid, motion, n_batches)

@@ -153,7 +153,6 @@ def assemble(
     try:
         hardware = resolve_profile(
             sequence.profile if profile is None else profile,
-            sequence_path.parent if profile is None else Path(),
             for_profile,
             dry_run,
             named_in=document if profile is None else None,

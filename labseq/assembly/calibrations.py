@@ -62,7 +62,7 @@ def open_store(profile: str, dry_run: DryRun = "off") -> tuple[Store, ProfileSpe
     Raises:
         ConfigError: The profile has an error, or does not exist.
     """
-    document, spec = load_profile(profile, beside=Path())
+    document, spec = load_profile(profile)
     return store_of(document, spec, dry_run), spec
 
 

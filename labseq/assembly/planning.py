@@ -114,7 +114,7 @@ def read_machine(
         if overrides:
             raise ConfigError(Problem("there is no --profile to change", overrides[0].source))
         return _default_machine(source), []
-    document, spec = load_profile(request.profile, beside=Path(), overrides=overrides)
+    document, spec = load_profile(request.profile, overrides=overrides)
     grid, motion = calibrated_machine(document, spec)
     if grid.shape != shape:
         what = f"the occupancy has {shape[0]} x {shape[1]} sites"

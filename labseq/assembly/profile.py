@@ -169,7 +169,6 @@ def check_dead_time(document: Document, spec: ProfileSpec, problems: ProblemColl
 
 def resolve_profile(
     profile: str | Path,
-    beside: Path = Path(),
     overrides: Sequence[Override] = (),
     dry_run: DryRun = "off",
     *,
@@ -182,7 +181,7 @@ def resolve_profile(
     """Read a profile, load the plugins and choose the plugin of each role.
 
     Args:
-        named_in: The sequence that names the profile, for messages.
+        named_in: The sequence that names the profile.
         plugin_folders: Folders with plugins that come before the profile's: those of the sequence.
         problems: Receives those of a readable profile; without it they are raised.
         recorded: The profile's text and calibrations, of a run that began earlier.
@@ -193,7 +192,6 @@ def resolve_profile(
     """
     document, spec = load_profile(
         profile,
-        beside=beside,
         overrides=overrides,
         named_in=named_in,
         scan=scan,

@@ -120,11 +120,9 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
         LabseqError: Another error ended the run.
     """
     _centre(method, request)  # a mistake in it is reported before the run is taken
-    document, spec = load_profile(request.profile, beside=Path(), overrides=_of_profile(request.overrides))
+    document, spec = load_profile(request.profile, overrides=_of_profile(request.overrides))
     ignoring = _ignoring(store_of(document, spec).folder, spec, method)
-    hardware = resolve_profile(
-        request.profile, Path(), _of_profile([*request.overrides, ignoring]), request.dry_run
-    )
+    hardware = resolve_profile(request.profile, _of_profile([*request.overrides, ignoring]), request.dry_run)
     run, result = _analysed(method, request, hardware, ignoring, observer)
     entry = CalibrationEntry(
         kind=method.kind,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Final
 
 from labseq.assembly.options import DryRun
@@ -257,7 +256,7 @@ def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
         if profile is None:
             host = load_plugins()
         else:
-            document, spec = load_profile(profile, beside=Path())  # the plugins that it names need not exist
+            document, spec = load_profile(profile)  # the plugins that it names need not exist
             host = load_plugins(plugin_paths(document, spec.plugin_folders), max_wait_s=spec.timeouts.load_s)
         host.import_all()
         show(Plugins.of(host))

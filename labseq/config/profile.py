@@ -383,7 +383,6 @@ _FALLBACKS: Final = FallbackValues(
 def load_profile(
     name_or_path: str | Path,
     *,
-    beside: Path,
     overrides: Sequence[Override | tuple[str, str]] = (),
     named_in: Document | None = None,
     scan: Scan | None = None,
@@ -393,10 +392,9 @@ def load_profile(
     """Find and read a hardware profile.
 
     Args:
-        name_or_path: See :func:`find_profile`.
-        beside: Folder of the file that names the profile.
+        name_or_path: See :func:`find_profile`: beside ``named_in``, else in the working folder.
         overrides: Values that replace those in the file, addresses without "profile.".
-        named_in: The sequence whose key ``profile`` names it, for messages.
+        named_in: The sequence whose key ``profile`` names it.
 
     Returns:
         The document, overrides included, and its content, with fallbacks for wrong values.
@@ -404,6 +402,7 @@ def load_profile(
     Raises:
         ConfigError: All errors, except in settings of plugins.
     """
+    beside = Path() if named_in is None else named_in.path.parent
     document = Document.read(find_profile(name_or_path, beside, named_in=named_in), kept)
     check_kind(document, "hardware profile")
     placed = [_of_profile(Override(*override)) for override in overrides]

@@ -113,7 +113,7 @@ def _parse(text: str) -> SampleRate:
 def _of_profile(profile: str, overrides: Sequence[str]) -> SampleRate:
     """The setting ``sample_rate`` of the mobile tweezers' plugin, if it has one."""
     _, for_profile = split_overrides(overrides)
-    document, spec = load_profile(profile, beside=Path(), overrides=for_profile)
+    document, spec = load_profile(profile, overrides=for_profile)
     host = load_plugins(plugin_paths(document, spec.plugin_folders), max_wait_s=spec.timeouts.load_s)
     chosen, warning = choose(host, document, spec, "mobile_tweezers", spec.mobile_tweezers, "full")
     rate_hz = getattr(chosen.settings, "sample_rate", None)

@@ -227,7 +227,7 @@ def make_profile_safe(
 def read_devices(profile: str, overrides: Sequence[str], problems: ProblemCollector) -> ResolvedProfile:
     """Read a profile and choose its devices; errors are tolerated as long as some devices are usable."""
     for_profile = profile_overrides(overrides)
-    document, spec = load_profile(profile, beside=Path(), overrides=for_profile, problems=problems)
+    document, spec = load_profile(profile, overrides=for_profile, problems=problems)
     with problems:
         plugin_paths(document, spec.plugin_folders)
     folders: list[Path] = []

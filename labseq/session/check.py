@@ -477,16 +477,27 @@ def _window_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
 
 def _light_warnings(assembly: Assembly, lab: Lab) -> Iterator[Problem]:
     """Imaging light that nothing switches, and light that might harm the camera and is not declared."""
-    hardware = assembly.hardware
-    document, lines, gain = hardware.document, hardware.profile.lines, lab.step_context.camera.em_gain
-    takes_image = any(step.takes_image for _, step in assembly.steps)
-    others_may = any(step.device_setting or step.signal for _, step in assembly.steps)
-    is_lit = others_may or any("image" in spec.on and not spec.triggers for spec in lab.line_specs)
-    if takes_image and not is_lit and hardware.chosen["camera"].identities("camera"):
+    if any(step.takes_image for _, step in assembly.steps) and not _may_be_lit(assembly, lab):
         what = "nothing of this profile switches the imaging light"
         hint = "a line for it, with `on: [image]`, under `lines`; see docs/how-to/lines.md"
-        yield document.problem(("camera", "use"), what, hint=hint)
-    for name, channel in {} if lines is None or gain <= 1 else lines.channels.items():
+        yield assembly.hardware.document.problem(("camera", "use"), what, hint=hint)
+    if lab.step_context.camera.em_gain > 1:
+        yield from _undeclared_light(assembly, lab.step_context.camera.em_gain)
+
+
+def _may_be_lit(assembly: Assembly, lab: Lab) -> bool:
+    """Whether a line or a step may switch the imaging light; a simulated camera needs none."""
+    if not assembly.hardware.chosen["camera"].identities("camera"):
+        return True
+    if any(step.device_setting or step.signal for _, step in assembly.steps):
+        return True
+    return any("image" in spec.on and not spec.triggers for spec in lab.line_specs)
+
+
+def _undeclared_light(assembly: Assembly, gain: float) -> Iterator[Problem]:
+    """Lines that may switch a light outside of exposures, and do not say whether it blinds the camera."""
+    document, lines = assembly.hardware.document, assembly.hardware.profile.lines
+    for name, channel in {} if lines is None else lines.channels.items():
         is_light = not (channel.triggers or channel.turns_off or "image" in channel.on)
         is_declared = document.get(("lines", "channels", name, "blinding")) is not None
         if is_light and channel.on and not is_declared:

@@ -37,7 +37,7 @@ simulation:
 
 def true_depths(profile: Path) -> NDArray[np.float64]:
     """Depths of mobile tweezers on all sites, by the program that a move gets and the lab's own response."""
-    _, spec = load_profile(str(profile), beside=profile.parent)
+    _, spec = load_profile(str(profile))
     grid, light = spec.grid_model(), MobileLightSettings(tone_response=0.14)
     full = full_amplitudes(grid, with_true_response(grid, spec.motion, light, 5))
     used = resolve_profile(str(profile))

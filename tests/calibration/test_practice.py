@@ -47,7 +47,7 @@ class Practice:
             assert old in text
             text = text.replace(old, new)
         self.profile.write_text(text, "utf-8")
-        document, spec = load_profile(str(self.profile), beside=folder)
+        document, spec = load_profile(str(self.profile))
         physics = document.validate(SimulationSettings, ("simulation",), drop={"use"})
         self.detector = document.validate(ThresholdSettings, ("detector",), drop={"use"})
         self.grid, self.image = spec.grid_model(), physics.image

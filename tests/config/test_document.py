@@ -126,7 +126,7 @@ def test_a_stored_text_replaces_the_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"(?m)^copy\.yaml:2:7: name is 5"):
         load_sequence(path, kept=kept)
     with pytest.raises(ConfigError, match=r"(?m)^copy\.yaml:2:7: name is 5"):
-        load_profile(path, beside=Path(), kept=kept)
+        load_profile(path, kept=kept)
 
 
 FALLBACKS = FallbackValues(

@@ -69,7 +69,7 @@ def test_profiles(path: Path, data: bytes) -> None:
     path.write_bytes(data)
 
     def load() -> None:
-        document, spec = load_profile(path.name, beside=path.parent)
+        document, spec = load_profile(path)
         spec.grid_model()
         for choice in spec.choices.values():
             document.validate(NoSettings, choice.loc, drop=document.get(choice.loc))

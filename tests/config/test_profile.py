@@ -30,7 +30,7 @@ DATA = Path(__file__).parent / "data"
 
 @pytest.fixture(scope="module")
 def loaded() -> tuple[Document, ProfileSpec]:
-    return load_profile("profile.yaml", beside=DATA)
+    return load_profile(DATA / "profile.yaml")
 
 
 def test_choices(loaded: tuple[Document, ProfileSpec]) -> None:
@@ -103,7 +103,7 @@ def test_the_grid_of_the_paper_is_the_default() -> None:
 
 
 def with_option(address: str, value: str) -> ProfileSpec:
-    return load_profile("profile.yaml", beside=DATA, overrides=[(address, value)])[1]
+    return load_profile(DATA / "profile.yaml", overrides=[(address, value)])[1]
 
 
 def test_options_reach_the_profile() -> None:
@@ -112,7 +112,7 @@ def test_options_reach_the_profile() -> None:
     assert with_option("mobile_tweezers.rf.max_peak", "1.5 V").motion.rf.max_peak_v == 1.5
     table = "[98 MHz, 100.1 MHz, 102 MHz]"
     options = [("grid.cols", "3"), ("grid.column_frequency", f"{{table: {table}}}")]
-    grid = load_profile("profile.yaml", beside=DATA, overrides=options)[1].grid_model()
+    grid = load_profile(DATA / "profile.yaml", overrides=options)[1].grid_model()
     np.testing.assert_array_equal(grid.column_frequency_hz, [98e6, 100.1e6, 102e6])
 
 
@@ -193,14 +193,14 @@ def test_the_first_message(tmp_path: Path, old: str, new: str, message: str) -> 
     path = tmp_path / "p.yaml"
     path.write_bytes(good.replace(old, new, 1).encode())
     with pytest.raises(ConfigError) as caught:
-        load_profile("p.yaml", beside=tmp_path)
+        load_profile(path)
     assert str(caught.value.problems[0]) == f"{path}:{message}"
 
 
 def calibrations(folder: Path, text: str, *overrides: tuple[str, str]) -> CalibrationSettings:
     path = folder / "bench.yaml"
     path.write_text((DATA / "profile.yaml").read_text("utf-8") + text, "utf-8")
-    return load_profile(path, beside=folder, overrides=overrides)[1].calibrations
+    return load_profile(path, overrides=overrides)[1].calibrations
 
 
 @pytest.mark.parametrize(

@@ -160,9 +160,9 @@ def test_the_reference_says_which_keys_of_a_profile_may_be_left_out(tmp_path: Pa
         path = written(tmp_path, PROFILE, without=key)
         if row[2] == "required":
             with pytest.raises(labseq.ConfigError, match=f"'{key}' is missing"):
-                load_profile(path, beside=tmp_path)
+                load_profile(path)
         else:
-            load_profile(path, beside=tmp_path)
+            load_profile(path)
 
 
 def written(folder: Path, content: Mapping[str, str], *, without: str) -> Path:

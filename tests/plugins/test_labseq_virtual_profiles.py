@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,7 +41,7 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def test_the_virtual_profile_states_the_defaults() -> None:
-    document, profile = load_profile("virtual", beside=Path())
+    document, profile = load_profile("virtual")
     assert all(choice.use == "virtual" for role, choice in profile.choices.items() if role != "detector")
     for role, model in MODELS.items():
         core_keys = {one.key for one in settings_of(MobileTweezersChoice)}
@@ -63,7 +62,7 @@ def test_the_virtual_profile_states_the_defaults() -> None:
 
 @pytest.mark.parametrize("name", ["virtual", "lab"])
 def test_the_profiles_describe_the_papers_machine(name: str) -> None:
-    document, profile = load_profile(name, beside=Path())
+    document, profile = load_profile(name)
     grid, paper = profile.grid_model(), SiteGrid()
     pause_s = 0.5e-3 if name == "virtual" else 0.0  # the paper's, not that of an AWG which plays samples
     assert replace(profile.motion, rf=RfSpec()) == MotionSpec(overhead_per_batch_s=pause_s)  # volts vary
