@@ -13,7 +13,6 @@ from typing import Any
 from labseq.data.shot import Shot, caching_loader
 from labseq.errors import RecordingError
 from labseq.files import NewLines
-from labseq.model.records import RunStatus
 from labseq.recording.folders import EVENTS_FILE, INDEX_FILE
 from labseq.recording.index import IndexRow, row_of_line
 from labseq.recording.run_file import read_record, read_state
@@ -58,11 +57,7 @@ class Follower:
     @property
     def is_over(self) -> bool:
         """Whether the run or its process has ended."""
-        return self.state()[0] != "running"
-
-    def state(self) -> tuple[RunStatus, str]:
-        """Status of the run, and the error that ended it."""
-        return read_state(self._run_dir)
+        return read_state(self._run_dir)[0] != "running"
 
     def now(self) -> float:
         """Time of the run in seconds, which goes on from that of the last of :meth:`events`."""

@@ -21,6 +21,7 @@ from labseq.errors import RecordingError
 from labseq.files import read_file
 from labseq.plain import to_plain
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
+from labseq.recording.run_file import read_state
 from labseq.web.endpoint import Endpoint, describe, in_thread
 from labseq.web.history import finite
 from labseq.web.live import MAX_VIEWERS, Live
@@ -111,7 +112,7 @@ class Api:
     def run(self, request: Request) -> Any:
         """A run: its head, figures, trend, losses, what was changed, and its files."""
         run = self._opened(request)
-        record, (status, error) = run.record, run.follower.state()
+        record, (status, error) = run.record, read_state(run.folder)
         run.history.update()
         columns = run.history.columns()
         changes: dict[str, Any] = record.get("overrides") or {}
@@ -192,7 +193,7 @@ class Api:
         line = self._line(run, request)
         record = run.record
         values = shot_values(run.shot(line), str(record.get("record_frames")))
-        status, error = run.follower.state()
+        status, error = read_state(run.folder)
         return {"run": head_of(run, record, status, error), "shot": values}
 
     async def frame(self, request: Request) -> Response:

@@ -136,7 +136,7 @@ class OpenRun:
 
     def outline(self) -> Run:
         """The run whose shots know only how they were judged, which is fast for any number of shots."""
-        status, error = self.follower.state()
+        status, error = read_state(self.folder)
         if not len(self.history):
             return Run(self.folder, self.record, status, error, (), ())
         columns, some_row = self.history.columns(), self.history.row(0)

@@ -27,7 +27,7 @@ from labseq.model.estimate import Rate, mean
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.plain import now
 from labseq.recording.folders import INDEX_FILE, STOP_FILE
-from labseq.recording.run_file import SCANNER
+from labseq.recording.run_file import SCANNER, read_state
 from labseq.web.history import Columns, finite, judged_values
 from labseq.web.runs import OpenRun, profile_of, read_notes, text_of
 from labseq.web.shots import rows_of, shot_values
@@ -80,7 +80,7 @@ class RunState:
             RecordingError: run.json is damaged, or a file cannot be read.
         """
         with self.run.lock:
-            record, (status, error) = self.run.record, self.run.follower.state()
+            record, (status, error) = self.run.record, read_state(self.run.folder)
             self.run.history.update()
             self.run.read_events()
             columns = self.run.history.columns()
