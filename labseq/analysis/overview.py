@@ -28,7 +28,6 @@ from labseq.analysis.charts import (
     stages_of_a_shot,
     trend,
 )
-from labseq.analysis.fits import Fit
 from labseq.analysis.scanned import (
     DEFAULT,
     Scanned,
@@ -43,6 +42,7 @@ from labseq.analysis.statistics import Statistics, Survival, SurvivalCounts, sta
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration_store import read_entry
 from labseq.data import Run, Shot
+from labseq.data.fits import Fit
 from labseq.data.images import loading_map
 from labseq.data.quantities import Quantity, steps_that_load
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites

@@ -10,11 +10,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.analysis.fits import Fit, fit_points
 from labseq.console.report import aligned
 from labseq.console.text import count_of
 from labseq.data import Run
 from labseq.data.columns import Column, make_column
+from labseq.data.fits import Fit, fit_points
 from labseq.data.points import ScanPoint, scan_points
 from labseq.data.quantities import Quantity, description_of, find_quantity, select_shots
 from labseq.errors import ConfigError, Problem

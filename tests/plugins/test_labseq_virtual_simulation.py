@@ -13,7 +13,7 @@ from labseq_virtual.simulation import VirtualSimulation
 from labseq_virtual.static_array import StaticArray
 from labseq_virtual.tweezers import SILENCE
 
-from labseq.analysis.fits import MODELS
+from labseq.data.fit_models import MODELS
 from labseq.model import AxisTones
 from labseq.motion import tone_program
 from labseq.plugin import (

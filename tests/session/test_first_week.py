@@ -10,7 +10,6 @@ import pytest
 
 import labseq
 from labseq.analysis.scanned import ScanRequest, scan_report
-from labseq.model.estimate import Estimate
 from labseq.session.check import check
 
 from .whole_runs import SMALL_FRAMES
@@ -50,7 +49,7 @@ def test_the_fitted_value_is_that_of_the_simulation(
         run = session.run()
     given = ("centre=0",) if name == "hand_over_ramp" else ()
     (found,) = scan_report(run, ScanRequest((quantity,), fit=fit, fit_settings=given)).fits
-    value: Estimate = found.values[parameter]
+    value = found.parameters[parameter]
     assert abs(value.value - true) < 3 * value.error + tolerance
     assert value.error < 0.25 * abs(true) + tolerance
 

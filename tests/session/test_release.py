@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import labseq
-from labseq.analysis.fits import fit_points
+from labseq.data.fits import fit_points
 from labseq.data.points import scan_points
 from labseq.session.check import check
 from labseq.testing.fakes import RecordingObserver
@@ -131,7 +131,7 @@ def test_the_recaptured_fraction_follows_the_temperature_of_the_profile(tmp_path
     x = [point.parameters["shot.recapture.duration"] for point in points]
     y = [survival.over(point.shots) for point in points]
     light = {"static_depth": 300e-6, "static_waist": 0.98e-6, "static_wavelength": 808e-9}
-    found = fit_points("release_recapture", x, y, ("s", "%"), settings=light).values["temperature"]
+    found = fit_points("release_recapture", x, y, ("s", "%"), settings=light).parameters["temperature"]
     assert abs(found.value - temperature_k) < 3 * found.error
     assert found.error < 0.06 * temperature_k
 

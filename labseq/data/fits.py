@@ -1,0 +1,329 @@
+"""Fits of a quantity against a scanned value."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from labseq.data.fit_models import MODELS, FitModel, Points, Solution
+from labseq.data.least_squares import Floats
+from labseq.errors import ConfigError, Problem, one_of
+from labseq.messages import clean, did_you_mean
+from labseq.model.estimate import Estimate, Estimated
+from labseq.units import UNITS, dimension_of, parse_any, readable_unit
+
+ROUNDING: Final = 1e-9
+"""Relative error below which a value counts as without error."""
+MAX_ERROR: Final = 10.0
+"""Largest error of a parameter, relative to its value or to the range of the points."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A fitted parameter.
+
+    Attributes:
+        value: Its value, SI; a fraction, where the text has per cent.
+        error: Its standard error; 0 if it was fixed.
+        text_unit: SI unit, in which "%" stands for a fraction: "%/s".
+    """
+
+    value: float
+    error: float
+    text_unit: str
+
+    @property
+    def unit(self) -> str:
+        """Its SI unit; "" for none."""
+        return self.text_unit.replace("%/", "1/").replace("%", "")
+
+    def __str__(self) -> str:
+        """The value with its error in a readable unit.
+
+        Example:
+            >>> str(Parameter(32.9, 0.8, "s")), str(Parameter(15e-6, 0, "K"))
+            ('32.9(8) s', '15 uK (fixed)')
+            >>> str(Parameter(0.97, 0.01, "%")), str(Parameter(-4e3, 1e2, "%/s"))
+            ('97(1) %', '-400(10) %/ms')
+        """
+        unit, factor = _readable(self.value, self.text_unit)
+        text = f"{Estimate(self.value, self.error).scaled(1 / factor)} {unit}".rstrip()
+        return text if self.error else f"{text} (fixed)"
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-ready, SI."""
+        return {"value": self.value, "error": self.error, "unit": self.unit}
+
+
+def _readable(value: float, unit: str) -> tuple[str, float]:
+    """A unit in which an SI value is readable, and its factor to SI."""
+    dimension = dimension_of(unit)
+    if dimension and dimension != "fraction":
+        unit = readable_unit(value, dimension)
+        return unit, UNITS[dimension][unit]
+    numerator, _, denominator = unit.partition("/")
+    factor = 0.01 if numerator == "%" else 1.0
+    base, _, power = denominator.partition("^")
+    # of the prefixes, the one that gives a number close to 10
+    sizes = {
+        f"{numerator}/{denominator.replace(base, one)}": factor / size ** int(power or 1)
+        for one, size in UNITS.get(dimension_of(base) if base else "", {}).items()
+        if one not in ("min", "h")
+    }
+    best = (
+        min(sizes, key=lambda one: abs(math.log10(abs(value) / sizes[one]) - 1)) if value and sizes else unit
+    )
+    return best, sizes.get(best, factor)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A fit of a quantity against a scanned value.
+
+    Attributes:
+        model: Name of the model.
+        formula: Its function of x.
+        parameters: Name -> value, error and unit.
+        reduced_chi_square: nan if the points have no errors.
+        x: The scanned values of the points, SI, rising.
+        y: The quantity at each.
+        errors: Its standard errors.
+    """
+
+    model: str
+    formula: str
+    parameters: Mapping[str, Parameter]
+    reduced_chi_square: float
+    x: Floats
+    y: Floats
+    errors: Floats
+    _function: Callable[[Floats], Floats]
+
+    def at(self, x: ArrayLike) -> Floats:
+        """The fitted function at values of x, SI."""
+        return self._function(np.asarray(x, np.float64))
+
+    @property
+    def residuals(self) -> Floats:
+        """The points minus the fitted function."""
+        return self.y - self.at(self.x)
+
+    @property
+    def free(self) -> Mapping[str, Parameter]:
+        """The parameters that were not fixed."""
+        return {name: parameter for name, parameter in self.parameters.items() if parameter.error}
+
+    def lines(self) -> list[str]:
+        """The result, a line for each parameter."""
+        has_errors = math.isfinite(self.reduced_chi_square)
+        chi2 = f"{self.reduced_chi_square:.2f}" if has_errors else "-, the points have no errors"
+        width = max(map(len, (*self.parameters, "chi-square")))
+        return [
+            f"fit {self.model}: {self.formula}",
+            *(f"  {name.ljust(width)}  {parameter}" for name, parameter in self.parameters.items()),
+            f"  {'chi-square'.ljust(width)}  {chi2} (reduced, {len(self.x)} points)",
+        ]
+
+    def short_lines(self) -> list[str]:
+        """The result for the legend of a picture: what was fitted, and the reduced chi-square."""
+        chi2 = self.reduced_chi_square
+        last = [f"reduced chi-square {chi2:.2f}"] if math.isfinite(chi2) else []
+        return [self.model, *(f"{name} {parameter}" for name, parameter in self.free.items()), *last]
+
+    def as_json(self) -> dict[str, Any]:
+        """The result, JSON-ready, SI."""
+        return {
+            "model": self.model,
+            "parameters": {name: parameter.as_json() for name, parameter in self.parameters.items()},
+            "reduced_chi_square": self.reduced_chi_square,
+            "points": len(self.x),
+        }
+
+
+def find_model(name: str) -> FitModel:
+    """A model by name.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    if name not in MODELS:
+        raise _problem(f"there is no fit '{clean(name)}'", one_of([*MODELS]), did_you_mean(name, MODELS))
+    return MODELS[name]
+
+
+def fit_points(
+    name: str,
+    x: Sequence[float],
+    values: Sequence[Estimated],
+    units: tuple[str, str],
+    given: Mapping[str, str | float] | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> Fit:
+    """Fit a model to points, weighted with their errors.
+
+    Args:
+        name: Name of the model.
+        x: The scanned values, SI.
+        values: A mean at each; those that are nan are left out.
+        units: SI units of both; "%" for a fraction.
+        given: Parameter -> its value, with a unit if it is text, at which it is fixed; or "free".
+        settings: Settings of the profile's simulation.
+
+    Raises:
+        ConfigError: There are too few points, a parameter is missing, or the fit fails; says which.
+    """
+    model = find_model(name)
+    points, fixed = _points(x, values), _fixed(model, given or {}, settings or {})
+    points, solution = _solve_determined(model, points, fixed, {*(given or {})})
+    parameters = {
+        name: Parameter(value.value, value.error, _unit_of(model.units.get(name, ""), *units))
+        for name, value in solution.values.items()
+    }
+    return Fit(
+        name,
+        model.formula,
+        {name: _within_a_turn(parameter) for name, parameter in parameters.items()},
+        solution.reduced_chi_square,
+        points.x,
+        points.y,
+        points.error,
+        solution.function,
+    )
+
+
+def _points(x: Sequence[float], values: Sequence[Estimated]) -> Points:
+    rows = [
+        (at, value.value, (value.interval[1] - value.interval[0]) / 2, getattr(value, "n_trials", 0))
+        for at, value in zip(x, values, strict=True)
+        if not math.isnan(value.value)
+    ]
+    if not rows:
+        raise _problem("no point has a result", "shots that have this quantity")
+    at, y, error, n_trials = np.array(sorted(rows), np.float64).T
+    is_known = np.isfinite(error) & (error > ROUNDING * np.abs(y))
+    if not is_known.any():
+        if np.ptp(y) == 0:
+            raise _problem("the quantity is the same at all points", "one that depends on the scanned value")
+        return Points(at, y, np.ones_like(y), has_errors=False, n_trials=n_trials)
+    # a point without an error, such as one of a single shot, counts as the worst of the others
+    error = np.where(is_known, error, error[is_known].max())
+    return Points(at, y, error, has_errors=True, n_trials=n_trials)
+
+
+def _solve_determined(
+    model: FitModel, points: Points, fixed: Mapping[str, float], given: Collection[str]
+) -> tuple[Points, Solution]:
+    """Fit, if need be without the parameters that the model can do without."""
+    try:
+        return _solve(model, points, fixed)
+    except ConfigError:
+        without = {name: value for name, value in model.without.items() if name not in given}
+        if not without:
+            raise
+        return _solve(model, points, {**fixed, **without})
+
+
+def _solve(model: FitModel, points: Points, fixed: Mapping[str, float]) -> tuple[Points, Solution]:
+    """Fit, with rates weighted by the errors that the fit itself expects.
+
+    Where few of few atoms survive by chance, the error seems smaller than where many do, and such points
+    would pull the fit: by half an error at 20 atoms per point.
+    """
+    _check_number(model, points, fixed)
+    solution = model.solve(points, fixed)
+    for _ in range(2 if points.n_trials.any() else 0):
+        if solution is not None:
+            points = points.with_errors_of(solution.function(points.x))
+            solution = model.solve(points, fixed, solution)
+    if solution is None:
+        raise _problem("the fit did not converge", model.advice)
+    _check_determined(model, solution.values, points)
+    return points, solution
+
+
+def _check_number(model: FitModel, points: Points, fixed: Mapping[str, float]) -> None:
+    free = [name for name in model.units if name not in fixed]
+    if not free:
+        raise _problem("all parameters are fixed", "at least one to fit")
+    n_values = len(np.unique(points.x))
+    if n_values <= len(free):
+        problem = f"{n_values} points are too few for a fit of {len(free)} parameters ({', '.join(free)})"
+        raise _problem(problem, f"at least {len(free) + 1} different values with a result")
+
+
+def _unit_of(unit: str, x_unit: str, y_unit: str) -> str:
+    """The SI unit of a parameter, with "%" for a fraction."""
+    numerator, _, denominator = unit.partition("/")
+    top = {"x": x_unit, "y": y_unit}.get(numerator, numerator)
+    if not denominator or not x_unit:
+        return "" if top == "1" else top
+    inverse = {"1/s": "Hz", "1/Hz": "s"} if numerator == "1" else {}
+    text = f"{top or '1'}/{denominator.replace('x', x_unit)}"
+    return inverse.get(text, text)
+
+
+def _within_a_turn(parameter: Parameter) -> Parameter:
+    """A phase between -pi and pi; any other parameter as it is."""
+    if parameter.text_unit != "rad":
+        return parameter
+    return replace(parameter, value=math.remainder(parameter.value, math.tau))
+
+
+def _check_determined(model: FitModel, values: Mapping[str, Estimate], points: Points) -> None:
+    """Refuse parameters with an error far larger than the range of the points, or that noise has as well."""
+    undetermined = [
+        name
+        for name, value in values.items()
+        if not math.isfinite(value.error)
+        or value.error > MAX_ERROR * max(abs(value.value), points.scale(model.units.get(name, "")))
+    ]
+    if undetermined:
+        raise _problem(f"the points do not determine {' and '.join(undetermined)}", model.advice)
+    for name, least in model.significance.items():
+        if values[name].error and abs(values[name].value) < least * values[name].error:
+            raise _problem(f"{name} cannot be told from noise", model.advice)
+
+
+def _fixed(
+    model: FitModel, given: Mapping[str, str | float], settings: Mapping[str, Any]
+) -> dict[str, float]:
+    """The parameters that are not fitted."""
+    fixed = dict(model.fixed)
+    keys = {"depth": "static_depth", "waist": "static_waist", "wavelength": "static_wavelength"}
+    for name, key in keys.items():
+        if name in fixed and isinstance(settings.get(key), int | float):
+            fixed[name] = float(settings[key])
+    for name, value in given.items():
+        if name not in model.units:
+            raise _problem(
+                f"the fit has no parameter '{clean(name)}'",
+                one_of([*model.units]),
+                did_you_mean(name, model.units),
+            )
+        fixed.pop(name, None)
+        if value != "free":
+            fixed[name] = _value(name, value)
+    missing = [name for name, value in fixed.items() if math.isnan(value)]
+    if missing:
+        problem = f"the fit needs {' and '.join(missing)}, which the run's profile does not have"
+        raise _problem(problem, " ".join(f"--fit-set {name}=VALUE" for name in missing))
+    return fixed
+
+
+def _value(name: str, value: str | float) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        try:
+            return parse_any(str(value))[0]
+        except ValueError as error:
+            raise _problem(f"{name}: {error}", "a number with its unit, or 'free'") from error
+
+
+def _problem(message: str, expected: str, hint: str = "") -> ConfigError:
+    return ConfigError(Problem(message, "--fit", expected=expected, hint=hint))
