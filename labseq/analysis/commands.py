@@ -110,8 +110,8 @@ def analyse(
     from labseq.analysis.scanned import scan_request
     from labseq.analysis.terminal import analyse_run
 
-    request = scan_request(scan, where, fit, fit_set)
-    raise typer.Exit(analyse_run(run, use, overrides or (), request, again=again))
+    request = scan_request([] if where and scan is None else scan, fit, fit_set)
+    raise typer.Exit(analyse_run(run, use, overrides or (), request, where, again=again))
 
 
 def plot(
@@ -160,6 +160,5 @@ def plot(
     from labseq.analysis.scanned import scan_request
     from labseq.analysis.terminal import PlotRequest, plot_run
 
-    plot_run(
-        run, PlotRequest(what, shot, cycle, scan_request(scan, where, fit, fit_set)), output, replace=force
-    )
+    request = PlotRequest(what, shot, cycle, scan_request(scan, fit, fit_set), tuple(where or ()))
+    plot_run(run, request, output, replace=force)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -16,7 +16,7 @@ from labseq.data import Run
 from labseq.data.columns import Column, make_column
 from labseq.data.fits import Fit, fit_points
 from labseq.data.points import ScanPoint, scan_points
-from labseq.data.quantities import Quantity, description_of, find_quantity, select_shots
+from labseq.data.quantities import Quantity, description_of, find_quantity
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate, Estimated, Rate
@@ -75,25 +75,13 @@ class Scanned:
         return [numbers[0][place[number]] for place in self.places], numbers[1]
 
 
-def scanned(run: Run, conditions: Sequence[str] = ()) -> Scanned | None:
+def scanned(run: Run) -> Scanned | None:
     """The points of a run's scan that have shots; None without a scan.
-
-    Args:
-        run: The run.
-        conditions: Only shots that meet all of them are kept, see
-            :func:`labseq.data.quantities.select_shots`.
 
     Raises:
         RecordingError: The scan in run.json is damaged.
-        ConfigError: A condition cannot be read.
     """
     points = scan_points(run)
-    if conditions:
-        selected = {shot.index for shot in select_shots(run, conditions)}
-        points = [
-            replace(point, shots=tuple(shot for shot in point.shots if shot.index in selected))
-            for point in points
-        ]
     if not points or not points[0].parameters:  # --set may have replaced every address
         return None
     rows = [tuple(map(clean, row)) for row in run.scan["written"]]
@@ -165,20 +153,17 @@ class ScanRequest:
 
     Attributes:
         names: Names of the quantities; none for :data:`DEFAULT`.
-        where: Conditions on the shots: "filling:before == 1".
         fit: A model of :data:`labseq.analysis.fits.MODELS`, or None.
         fit_settings: "NAME=VALUE" for parameters of the fit.
     """
 
     names: tuple[str, ...] = ()
-    where: tuple[str, ...] = ()
     fit: str | None = None
     fit_settings: tuple[str, ...] = ()
 
 
 def scan_request(
     names: Sequence[str] | None,
-    where: Sequence[str] | None = None,
     fit: str | None = None,
     fit_settings: Sequence[str] | None = None,
 ) -> ScanRequest | None:
@@ -189,11 +174,9 @@ def scan_request(
     """
     if fit_settings and fit is None:
         raise ConfigError(Problem("this needs a fit", "--fit-set", expected="--fit MODEL as well"))
-    if names is None and not where and fit is None:
+    if names is None and fit is None:
         return None
-    return ScanRequest(
-        tuple(name for name in names or () if name), tuple(where or ()), fit, tuple(fit_settings or ())
-    )
+    return ScanRequest(tuple(name for name in names or () if name), fit, tuple(fit_settings or ()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -304,18 +287,13 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
     """
     if not run.shots:
         raise ConfigError(Problem("the run has no shots yet", visible(str(run.path))))
-    scan = scanned(run, request.where)
-    if scan is None:
-        scan = Scanned((), ((),), (ScanPoint({}, {}, select_shots(run, request.where)),))
+    scan = scanned(run) or Scanned((), ((),), (ScanPoint({}, {}, tuple(run.shots)),))
     names = request.names or (*_aim(run), *(WITHOUT_TARGET if run.target.is_none else DEFAULT))
     quantities = [find_quantity(run, name) for name in names]
     values = tuple((quantity, scan.over(quantity)) for quantity in quantities)
     for quantity, means in values if request.names else ():
         if all(math.isnan(mean.value) for mean in means):
-            where = f" that meets {' and '.join(request.where)}" if request.where else ""
-            raise ConfigError(
-                Problem(f"no shot{where} has a value of '{quantity.name}'", clean(run.path.name))
-            )
+            raise ConfigError(Problem(f"no shot has a value of '{quantity.name}'", clean(run.path.name)))
     fits = (
         tuple(_fit(run, scan, quantity, means, request) for quantity, means in values) if request.fit else ()
     )

@@ -249,10 +249,19 @@ def analyse_run(
     use: str | None,
     overrides: Sequence[str],
     request: ScanRequest | None = None,
+    where: Sequence[str] | None = None,
     *,
     again: bool,
 ) -> int:
     """Analyse the shots of a run that have no result yet, and print how many; then the scan.
+
+    Args:
+        path: The run's folder; the newest if it is None.
+        use: One analysis, or None for all that the sequence names.
+        overrides: "key=value" for its settings.
+        request: What to print of the scan.
+        where: Conditions on the shots that are printed.
+        again: Whether to analyse all shots again.
 
     Returns:
         The exit code: 1 if the analysis of a shot failed.
@@ -264,7 +273,7 @@ def analyse_run(
         _report(outcome)
         failed = failed or bool(outcome.failures)
     if request is not None:
-        say(*([""] if analyses else []), *scan_report(run, request).as_text())
+        say(*([""] if analyses else []), *scan_report(run.select(*where or ()), request).as_text())
     return int(failed)
 
 
@@ -310,12 +319,14 @@ class PlotRequest:
         shot: A shot, counted from 0.
         cycle: A cycle of it, counted from 0.
         scan: Quantities at the points of the scan.
+        where: Conditions on the shots that are drawn.
     """
 
     what: str | None = None
     shot: int | None = None
     cycle: int | None = None
     scan: ScanRequest | None = None
+    where: tuple[str, ...] = ()
 
     def check(self) -> None:
         """Check that the options are compatible.
@@ -364,7 +375,7 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, rep
         campaign_picture(folder).save(path)
         say(f"written: {path}")
         return
-    opened_run = chosen_run(run)
+    opened_run = chosen_run(run, request.where)
     if request.shot is not None:
         save_shot(path, shot_picture(opened_run, request.shot, request.cycle))
     elif request.scan is not None:

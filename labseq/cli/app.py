@@ -329,8 +329,8 @@ def show(
     from labseq.analysis.scanned import scan_request
     from labseq.cli.show import Tables, show_run
 
-    wanted = scan_request(scan, where, fit, fit_set)
-    show_run(run, as_json=as_json, tables=Tables(shots, timing, wanted, devices))
+    wanted = scan_request(scan, fit, fit_set)
+    show_run(run, as_json=as_json, tables=Tables(shots, timing, wanted, devices), where=where)
 
 
 @app.command(short_help="Watch a run that another process takes.")
@@ -380,11 +380,11 @@ def export(
     from labseq.analysis.scanned import scan_request
     from labseq.cli.data import export_points, export_to
 
-    wanted = scan_request(scan, where)
+    wanted = scan_request(scan)
     if wanted is not None:
-        export_points(run, to or "csv", output, wanted, replace=force)
+        export_points(run, to or "csv", output, wanted, where, replace=force)
         return
-    raise typer.Exit(export_to(run, to, output, frames=frames, replace=force))
+    raise typer.Exit(export_to(run, to, output, where, frames=frames, replace=force))
 
 
 @app.command(epilog=DOCTOR_EXAMPLES, short_help="Find and repair damage in recorded data.")

@@ -102,7 +102,15 @@ def _within(path: Path, root: Path) -> str:
     return str(path.relative_to(root.absolute()) if path.is_relative_to(root.absolute()) else path)
 
 
-def export_to(run: Path | None, kind: str | None, output: Path | None, *, frames: bool, replace: bool) -> int:
+def export_to(
+    run: Path | None,
+    kind: str | None,
+    output: Path | None,
+    where: Sequence[str] | None = None,
+    *,
+    frames: bool,
+    replace: bool,
+) -> int:
     """Export a run or a campaign, and print the names of the files.
 
     Returns:
@@ -113,6 +121,9 @@ def export_to(run: Path | None, kind: str | None, output: Path | None, *, frames
         if kind not in (None, "netcdf"):
             what = f"a campaign cannot be exported as '{visible(kind)}'"
             raise ConfigError(Problem(what, "--to", expected="netcdf"))
+        if where:
+            what = "a campaign is exported with all its shots"
+            raise ConfigError(Problem(what, "--where", expected="one of its runs"))
         path = output or Path(f"{folder.resolve().name}.nc")
         check_export("netcdf", path, frames=frames, replace=replace)
         export_campaign(folder, path)
@@ -120,7 +131,7 @@ def export_to(run: Path | None, kind: str | None, output: Path | None, *, frames
     kind = kind or "csv"
     if output is not None:
         check_export(kind, output, frames=frames, replace=replace)
-    opened = chosen_run(run)
+    opened = chosen_run(run, where)
     path = output or Path(f"{opened.path.parent.name}_{opened.path.name}{ENDINGS.get(kind, '')}")
     check_export(kind, path, frames=frames, replace=replace)
     left_out = export_run(opened, kind, path, frames=frames)
@@ -132,13 +143,19 @@ def export_to(run: Path | None, kind: str | None, output: Path | None, *, frames
 
 
 def export_points(
-    run: Path | None, kind: str, output: Path | None, request: ScanRequest, *, replace: bool
+    run: Path | None,
+    kind: str,
+    output: Path | None,
+    request: ScanRequest,
+    where: Sequence[str] | None = None,
+    *,
+    replace: bool,
 ) -> None:
     """Write a CSV file with a row for each point of a scan, and print its name."""
     if kind != "csv":
         what = f"the points of a scan cannot be exported as '{visible(kind)}'"
         raise ConfigError(Problem(what, "--to", expected="csv"))
-    opened = chosen_run(run)
+    opened = chosen_run(run, where)
     path = output or Path(f"{opened.path.parent.name}_{opened.path.name}.points.csv")
     check_export(kind, path, replace=replace)
     report = scan_report(opened, request)

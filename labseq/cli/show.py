@@ -40,11 +40,13 @@ class Tables:
         return self.shots or self.timing or self.scan is not None or self.devices
 
 
-def show_run(path: Path | None, *, as_json: bool, tables: Tables | None = None) -> None:
-    """Print the summary or tables of a run; without a path, of the newest."""
+def show_run(
+    path: Path | None, *, as_json: bool, tables: Tables | None = None, where: Sequence[str] | None = None
+) -> None:
+    """Print the summary or tables of a run, by default the newest, or of those shots that meet conditions."""
     wanted = tables or Tables()
     try:
-        run = chosen_run(path)
+        run = chosen_run(path, where)
         report = RunTables.of(run, wanted) if wanted.any else Summary.of(run)
     except LabseqError as error:
         if as_json:

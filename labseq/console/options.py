@@ -211,8 +211,8 @@ Where = Annotated[
     list[str] | None,
     typer.Option(
         metavar="CONDITION",
-        help="Only shots in which a quantity meets a condition, for example 'filling:before == 1'; may be "
-        "given several times.",
+        help="Only shots in which a quantity, a scanned value or any column of labseq export meets a "
+        "condition: 'filling:before == 1', 'shot.hold.duration > 5 ms'; may be given several times.",
     ),
 ]
 FitName = Annotated[

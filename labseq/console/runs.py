@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from labseq.data import Run, open_run
@@ -12,14 +13,18 @@ from labseq.recording import data_root
 from labseq.recording.folders import RUN_FILE, counter_of, find_run, runs_in
 
 
-def chosen_run(path: Path | None) -> Run:
+def chosen_run(path: Path | None, where: Sequence[str] | None = None) -> Run:
     """Open the run that a command is given; see :func:`folder_of_run`.
 
+    Args:
+        path: As that takes it.
+        where: Conditions that its shots must meet.
+
     Raises:
-        ConfigError: There is no such run.
+        ConfigError: There is no such run, or no such shot.
         RecordingError: It is damaged.
     """
-    return open_run(folder_of_run(path))
+    return open_run(folder_of_run(path)).select(*where or ())
 
 
 def folder_of_run(path: Path | None) -> Path:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from labseq.data.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, quantities_in
+from labseq.data.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, columns_of, quantities_in
 from labseq.data.shot import Shot
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, closest
@@ -318,7 +318,7 @@ def select_shots(run: Run, conditions: Iterable[str]) -> tuple[Shot, ...]:
     """The shots of a run that meet every condition, such as "filling:before == 1".
 
     Raises:
-        ConfigError: A condition cannot be read, or names no quantity of the run.
+        ConfigError: A condition cannot be read, or names neither a quantity nor a column of the run.
     """
     shots = tuple(run.shots)
     for condition in conditions:
@@ -326,12 +326,42 @@ def select_shots(run: Run, conditions: Iterable[str]) -> tuple[Shot, ...]:
         if match is None:
             message = f"this is not a condition: '{clean(condition)}'"
             raise ConfigError(Problem(message, "--where", expected="for example 'filling:before == 1'"))
-        quantity, compare = find_quantity(run, match[1]), _COMPARISONS[match[2]]
-        try:
-            limit = float(match[3]) if re.fullmatch(r"[-+.\deE]+", match[3]) else parse_any(match[3])[0]
-        except ValueError as error:
-            raise ConfigError(
-                Problem(str(error), "--where", expected="a number, or one with a unit")
-            ) from error
-        shots = tuple(shot for shot in shots if compare(quantity.of_shot(shot), limit))
+        name, comparison, limit = match.groups()
+        value_of, is_text = _values_for_conditions(run, name)
+        meets = _text_condition(comparison, limit) if is_text else _number_condition(comparison, limit)
+        shots = tuple(shot for shot in shots if meets(value_of(shot)))
     return shots
+
+
+def _values_for_conditions(run: Run, name: str) -> tuple[Callable[[Shot], Any], bool]:
+    """The values of a column of the export, or of a quantity, and whether they are text."""
+    columns = {column.name: column for column in columns_of(run)}
+    if name in columns:
+        values = columns[name].values
+        of_shot = dict(zip((shot.index for shot in run.shots), values.tolist(), strict=True))
+        return lambda shot: of_shot[shot.index], values.dtype == object
+    if split_name(name)[0] not in OF_IMAGES:
+        near = closest(name, [*columns, *OF_IMAGES])
+        raise ConfigError(
+            Problem(
+                f"there is no quantity or column '{clean(name)}'",
+                "--where",
+                expected="a quantity, such as filling:before, or a column of labseq export",
+                hint=f"did you mean '{near}'?" if near else "",
+            )
+        )
+    return find_quantity(run, name).of_shot, False
+
+
+def _number_condition(comparison: str, text: str) -> Callable[[float], bool]:
+    try:
+        limit = float(text) if re.fullmatch(r"[-+.\deE]+", text) else parse_any(text)[0]
+    except ValueError as error:
+        raise ConfigError(Problem(str(error), "--where", expected="a number, or one with a unit")) from error
+    return lambda value: _COMPARISONS[comparison](value, limit)
+
+
+def _text_condition(comparison: str, text: str) -> Callable[[str], bool]:
+    if comparison not in ("==", "!="):
+        raise ConfigError(Problem(f"'{comparison}' does not compare text", "--where", expected="== or !="))
+    return lambda value: (value == text) == (comparison == "==")

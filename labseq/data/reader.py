@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from labseq.data.shot import Shot, caching_loader
-from labseq.errors import RecordingError
+from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import read_lines
+from labseq.messages import clean
 from labseq.model import TargetPattern
 from labseq.model.estimate import mean
 from labseq.model.records import RunStatus
@@ -199,6 +200,25 @@ class Run:
         from labseq.data.quantities import find_quantity
 
         return find_quantity(self, name)
+
+    def select(self, *conditions: str) -> Run:
+        """The run with only those shots that count and meet all conditions.
+
+        Args:
+            conditions: Comparisons of a quantity or a column of :meth:`to_dataframe` with a value:
+                "filling:before == 1", "shot.hold.duration > 5 ms".
+
+        Raises:
+            ConfigError: A condition cannot be read, or no shot meets all of them.
+        """
+        from labseq.data.quantities import select_shots
+
+        if not conditions:
+            return self
+        shots = select_shots(self, conditions)
+        if not shots:
+            raise ConfigError(Problem(f"no shot meets {' and '.join(conditions)}", clean(self.path.name)))
+        return replace(self, shots=shots, attempts=())
 
     def summary(self) -> dict[str, Any]:
         """The main results of the run, JSON-ready; None for a missing number."""

@@ -90,6 +90,14 @@ def test_shots_are_selected_by_any_quantity(lifetime: labseq.Run) -> None:
     ]
     assert 0 < len(chosen) < 6
     assert list(chosen) == wanted
+    held = select_shots(lifetime, ["shot.hold.duration == 10 s", "status == complete", "shot > 0"])
+    assert {shot.parameters["shot.hold.duration"] for shot in held} == {10.0}
+    with pytest.raises(ConfigError, match=r"column 'shot.hold.durtion'.*did you mean 'shot.hold.duration'"):
+        select_shots(lifetime, ["shot.hold.durtion == 10 s"])
+    with pytest.raises(ConfigError, match="'<' does not compare text; expected == or !="):
+        select_shots(lifetime, ["status < 3"])
+    with pytest.raises(ConfigError, match="no shot meets loading:before > 2"):
+        lifetime.select("loading:before > 2")
     with pytest.raises(ConfigError, match="this is not a condition: 'before full'"):
         select_shots(lifetime, ["before full"])
 
@@ -149,6 +157,11 @@ def test_the_commands_show_write_and_draw_the_same_points(
     answer = json.loads(printed("show", run, *scan, "--json", "--where", "loading > 0.74"))
     shots = select_shots(lifetime, ["loading > 0.74"])
     assert sum(point["shots"] for point in answer["points"]) == len(shots) < 12
+    rows = printed("show", run, "--shots", "--where", "shot.hold.duration > 30 s").splitlines()
+    assert [row.split()[1:3] for row in rows[1:]].count(["80", "s"]) == 2
+    assert len(rows) == 1 + 4
+    assert printed("export", run, "--where", "loading > 0.74", "-o", "shots.csv").startswith("written: shots")
+    assert len((tmp_path / "shots.csv").read_text().splitlines()) == 1 + len(shots)
     assert printed("export", run, *scan, "-o", "points.csv") == (
         "written: points.csv\nwritten: points.units.csv\n"
     )
