@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq.analysis.overview import RunPicture, scan_panels
-from labseq.analysis.scanned import DEFAULT, WITHOUT_TARGET, Scanned, make_axis
+from labseq.analysis.scanned import DEFAULT, WITHOUT_TARGET
 from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, Point, recorded_runs
 from labseq.console.output import say
 from labseq.console.text import plural
@@ -18,6 +18,7 @@ from labseq.data import Run, Shot
 from labseq.data.columns import quantities_in
 from labseq.data.points import ScanPoint
 from labseq.data.quantities import Quantity, description_of
+from labseq.data.scanned import Scanned, make_axis
 from labseq.data.tables import check_installed
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import explained, whole_file

@@ -5,7 +5,16 @@ from typing import Annotated
 
 import typer
 
-from labseq.console.options import FitName, FitSettings, Json, Plugins, RunFolder, ScanQuantities, Where
+from labseq.console.options import (
+    Along,
+    FitName,
+    FitSettings,
+    Json,
+    Plugins,
+    RunFolder,
+    ScanQuantities,
+    Where,
+)
 
 REPLAY_EXAMPLES = """\b
 Examples:
@@ -101,6 +110,7 @@ def analyse(
     where: Where = None,
     fit: FitName = None,
     fit_set: FitSettings = None,
+    along: Along = None,
     _plugins: Plugins = None,
 ) -> None:
     """Analyse the shots of a run that have no result yet; with --scan, then print it.
@@ -110,7 +120,7 @@ def analyse(
     from labseq.analysis.scanned import scan_request
     from labseq.analysis.terminal import analyse_run
 
-    request = scan_request([] if where and scan is None else scan, fit, fit_set)
+    request = scan_request([] if where and scan is None else scan, fit, fit_set, along)
     raise typer.Exit(analyse_run(run, use, overrides or (), request, where, again=again))
 
 
@@ -151,6 +161,7 @@ def plot(
     where: Where = None,
     fit: FitName = None,
     fit_set: FitSettings = None,
+    along: Along = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file of --output.")] = False,
 ) -> None:
     """Draw a run, finished or not: an overview, one part of it, the points of a scan, or a shot.
@@ -160,5 +171,5 @@ def plot(
     from labseq.analysis.scanned import scan_request
     from labseq.analysis.terminal import PlotRequest, plot_run
 
-    request = PlotRequest(what, shot, cycle, scan_request(scan, fit, fit_set), tuple(where or ()))
+    request = PlotRequest(what, shot, cycle, scan_request(scan, fit, fit_set, along), tuple(where or ()))
     plot_run(run, request, output, replace=force)

@@ -30,11 +30,8 @@ from labseq.analysis.charts import (
 )
 from labseq.analysis.scanned import (
     DEFAULT,
-    Scanned,
     ScanRequest,
-    is_geometric,
     scan_report,
-    scanned,
     shown_unit,
     title_of,
 )
@@ -42,14 +39,15 @@ from labseq.analysis.statistics import Statistics, Survival, SurvivalCounts, sta
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration_store import read_entry
 from labseq.data import Run, Shot
-from labseq.data.fits import Fit
+from labseq.data.fits import Fit, readable
 from labseq.data.images import loading_map
 from labseq.data.quantities import Quantity, steps_that_load
+from labseq.data.scanned import FitAt, Scanned, is_geometric, scanned
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites
 from labseq.errors import ConfigError, Problem, RecordingError, one_of
 from labseq.messages import clean, visible
 from labseq.model import CalibrationEntry, SiteGrid
-from labseq.model.estimate import Estimated, Rate
+from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.pictures.figures import make_figure, save_figure
 from labseq.roles import Context
 from labseq.units import factor_of
@@ -231,7 +229,7 @@ def stages_panel(run: Run, timing: RunTiming) -> Panel | None:
     return stages_of_a_shot(f"stages of a shot{part_text(timing.n_read, run)}", stages, clocks)
 
 
-def scan_panels(scan: Scanned, quantity: Quantity, fit: Fit | None = None) -> Row:
+def scan_panels(scan: Scanned, quantity: Quantity, fits: Sequence[FitAt] = ()) -> Row:
     """A quantity against the scanned values: a curve for one axis, maps for more; empty if it is unknown."""
     means = scan.over(quantity)
     values = [mean.value for mean in means if not math.isnan(mean.value)]
@@ -240,7 +238,9 @@ def scan_panels(scan: Scanned, quantity: Quantity, fit: Fit | None = None) -> Ro
     unit, factor = shown_unit(quantity, values)
     label = f"{title_of(quantity)} ({unit})" if unit else title_of(quantity)
     if len(scan.axes) > 1 and scan.is_map:
-        return _scan_maps(scan, title_of(quantity), [mean.value / factor for mean in means], label)
+        maps = _scan_maps(scan, title_of(quantity), [mean.value / factor for mean in means], label)
+        return (*maps, *_parameter_panels(scan, fits))
+    fit = fits[0].fit if fits else None
     from_zero = quantity.is_rate and (fit is None or quantity.name == "defect_free")
     common: dict[str, Any] = {"y_label": label, "scale": 1 / factor, "from_zero": from_zero}
     if len(scan.axes) == 1:
@@ -279,6 +279,33 @@ def _scan_curve(
         line_label="" if fit is None else "\n".join(fit.short_lines()),
         **common,
     )
+
+
+def _parameter_panels(scan: Scanned, fits: Sequence[FitAt]) -> Row:
+    """Each fitted parameter against the axis that the fits are not along; none if there are more."""
+    made = [(at, at.fit) for at in fits if at.fit is not None]
+    if not made or len(made[0][0].values) != 1:
+        return ()
+    (address,) = made[0][0].values
+    axis = next(axis for axis in scan.axes if axis.address == address)
+    numbers, unit = axis.numbers or (tuple(range(len(axis.labels))), "")
+    x = [numbers[axis.labels.index(at.written[address])] for at, _ in made]
+    panels: list[Panel] = []
+    for name in dict.fromkeys(name for _, fit in made for name in fit.free):
+        parameters = [fit.parameters[name] for _, fit in made]
+        shown, factor = readable(max(abs(one.value) for one in parameters), parameters[0].text_unit)
+        panels.append(
+            partial(
+                draw_curves,
+                title=f"{name} of the {made[0][1].model} fits",
+                x_label=f"{address} ({unit})" if unit else address,
+                y_label=f"{name} ({shown})" if shown else name,
+                curves={"": points_of(x, [Estimate(one.value, one.error) for one in parameters])},
+                ticks=() if axis.numbers else axis.labels,
+                scale=1 / factor,
+            )
+        )
+    return tuple(panels)
 
 
 def _fitted(fit: Fit, factor: float, x: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -323,10 +350,10 @@ def scan_picture(run: Run, request: ScanRequest) -> RunPicture:
     if not report.scan.axes:
         expected = "a run of a sequence with 'scan:'; `labseq show --scan` prints the values of this one"
         raise cannot_draw(run, "it has no scan", expected)
-    fits = report.fits or (None,) * len(report.values)
+    fits = report.fits or ((),) * len(report.values)
     rows = [
-        scan_panels(report.scan, quantity, fit)
-        for (quantity, _), fit in zip(report.values, fits, strict=True)
+        scan_panels(report.scan, quantity, fits_of_quantity)
+        for (quantity, _), fits_of_quantity in zip(report.values, fits, strict=True)
     ]
     panels = [panel for row in rows for panel in row]
     return _picture(run, "the scan", [tuple(panels)] if len(panels) <= MAX_PANELS else rows)

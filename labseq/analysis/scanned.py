@@ -1,26 +1,23 @@
-"""The points of a scan, the quantities at each, their tables, and fits of them."""
+"""What is printed of a scan: the quantities at its points and their fits."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
-
-import numpy as np
 
 from labseq.console.report import aligned
 from labseq.console.text import count_of
 from labseq.data import Run
 from labseq.data.columns import Column, make_column
-from labseq.data.fits import Fit, fit_points
-from labseq.data.points import ScanPoint, scan_points
+from labseq.data.points import ScanPoint
 from labseq.data.quantities import Quantity, description_of, find_quantity
+from labseq.data.scanned import FitAt, FitRequest, Scanned, fits_along, scanned
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate, Estimated, Rate
-from labseq.units import UNITS, dimension_of, factor_of, readable_unit, si_unit_of, split_quantity
+from labseq.units import UNITS, dimension_of, readable_unit
 
 DEFAULT: Final = ("filling", "defect_free")
 """The quantities at the points of a scan, unless others are named."""
@@ -29,154 +26,44 @@ WITHOUT_TARGET: Final = ("n_loaded", "n_atoms")
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
-    """A scanned address and its values.
-
-    Attributes:
-        address: The address, and those that change together with it.
-        labels: Its different values as written, in the order of the scan.
-        numbers: The same as numbers, and the unit of these; None if they are not numbers of one dimension.
-    """
-
-    address: str
-    labels: tuple[str, ...]
-    numbers: tuple[tuple[float, ...], str] | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Scanned:
-    """The points of a scan.
-
-    Attributes:
-        axes: Independent addresses, the slowest first.
-        places: Index of each point's value on each axis.
-        points: The points, with their shots.
-    """
-
-    axes: tuple[Axis, ...]
-    places: tuple[tuple[int, ...], ...]
-    points: tuple[ScanPoint, ...]
-
-    @property
-    def is_map(self) -> bool:
-        """Whether there are two axes or more, and most combinations of their values have a point."""
-        n_cells = math.prod(len(axis.labels) for axis in self.axes)
-        return len(self.axes) > 1 and len({*self.places}) >= n_cells / 2
-
-    def over(self, quantity: Quantity) -> list[Estimated]:
-        """The mean of a quantity at each point."""
-        return [quantity.over(point.shots) for point in self.points]
-
-    def on_axis(self, number: int) -> tuple[list[float], str] | None:
-        """Each point's value on an axis, and the unit that it is written in; None if they are not numbers."""
-        numbers = self.axes[number].numbers
-        if numbers is None:
-            return None
-        return [numbers[0][place[number]] for place in self.places], numbers[1]
-
-
-def scanned(run: Run) -> Scanned | None:
-    """The points of a run's scan that have shots; None without a scan.
-
-    Raises:
-        RecordingError: The scan in run.json is damaged.
-    """
-    points = scan_points(run)
-    if not points or not points[0].parameters:  # --set may have replaced every address
-        return None
-    rows = [tuple(map(clean, row)) for row in run.scan["written"]]
-    columns, values = list(zip(*rows, strict=True)), list(zip(*run.scan["points"], strict=True))
-    numbers = [_numbers(*pair) for pair in zip(values, columns, strict=True)]
-    addresses = list(map(clean, points[0].written))
-    # an axis at least, even if all points have the same value
-    varied = [i for i, column in enumerate(columns) if len({*column}) > 1] or [0]
-    together: dict[int, list[str]] = {}
-    # addresses that change together share an axis
-    for i in varied:
-        leader = next((k for k in together if _follows(columns, numbers, i, k)), i)
-        together.setdefault(leader, []).append(addresses[i])
-    axes = tuple(make_axis(" with ".join(names), columns[i], values[i]) for i, names in together.items())
-    written = [tuple(map(clean, point.written.values())) for point in points]
-    places = tuple(
-        tuple(axis.labels.index(row[i]) for axis, i in zip(axes, together, strict=True)) for row in written
-    )
-    return Scanned(axes, places, tuple(points))
-
-
-def make_axis(address: str, labels: Sequence[str], values: Sequence[Any]) -> Axis:
-    """An axis from the labels and values, SI, of its points, of which some may be equal."""
-    value_of_label = dict(zip(labels, values, strict=True))
-    return Axis(address, tuple(value_of_label), _numbers([*value_of_label.values()], [*value_of_label]))
-
-
-def _follows(
-    columns: Sequence[Sequence[str]], numbers: Sequence[tuple[Sequence[float], str] | None], i: int, k: int
-) -> bool:
-    """Whether the values of address i change together with those of address k, and not by chance.
-
-    No two points of an optimiser share a value; numbers must then rise or fall together.
-    """
-    leader, own_numbers, leader_numbers = columns[k], numbers[i], numbers[k]
-    if len({*zip(columns[i], leader, strict=True)}) > len({*leader}):
-        return False
-    if len({*leader}) < len(leader) or own_numbers is None or leader_numbers is None:
-        return True
-    steps = np.diff(np.array(own_numbers[0])[np.argsort(leader_numbers[0], kind="stable")])
-    return bool((steps >= 0).all() or (steps <= 0).all())
-
-
-def _numbers(values: Sequence[Any], written: Sequence[str]) -> tuple[tuple[float, ...], str] | None:
-    """Values as numbers in the unit of the largest, and that unit; None unless they have one dimension."""
-    if not all(type(value) in (int, float) for value in values):
-        return None
-    units = [split_quantity(text)[1] for text in written]
-    if len({dimension_of(unit) for unit in units}) > 1:
-        return None
-    unit = units[int(np.argmax(np.abs(values)))]
-    # without the rounding error of the division: 0.3 ms, not 0.30000000000000004 ms
-    return tuple(float(f"{value / factor_of(unit):.12g}") for value in values), re.sub(
-        r"\bu(?=[msVWK]\b)", "µ", unit
-    )
-
-
-def is_geometric(values: Sequence[float]) -> bool:
-    """Whether rising values have nearly equal ratios, over a wide range."""
-    if len(values) < 3 or values[0] <= 0 or values[-1] < 20 * values[0]:
-        return False
-    steps = np.diff(np.log(values))
-    return float(np.ptp(steps)) <= 0.5 * float(steps.mean())  # "1, 2, 5, 10" passes
-
-
-@dataclass(frozen=True, slots=True)
 class ScanRequest:
     """The quantities to show at the points of a scan, and their fits.
 
     Attributes:
         names: Names of the quantities; none for :data:`DEFAULT`.
-        fit: A model of :data:`labseq.analysis.fits.MODELS`, or None.
-        fit_settings: "NAME=VALUE" for parameters of the fit.
+        fit: The fit of each; None without.
     """
 
     names: tuple[str, ...] = ()
-    fit: str | None = None
-    fit_settings: tuple[str, ...] = ()
+    fit: FitRequest | None = None
 
 
 def scan_request(
     names: Sequence[str] | None,
     fit: str | None = None,
     fit_settings: Sequence[str] | None = None,
+    along: str | None = None,
 ) -> ScanRequest | None:
     """The options of a command as a request; None if there are none.
 
     Raises:
-        ConfigError: Settings of a fit are given without a fit.
+        ConfigError: Settings of a fit are given without a fit, or without a value.
     """
-    if fit_settings and fit is None:
-        raise ConfigError(Problem("this needs a fit", "--fit-set", expected="--fit MODEL as well"))
+    for option, value in (("--fit-set", fit_settings), ("--along", along)):
+        if value and fit is None:
+            raise ConfigError(Problem("this needs a fit", option, expected="--fit MODEL as well"))
     if names is None and fit is None:
         return None
-    return ScanRequest(tuple(name for name in names or () if name), fit, tuple(fit_settings or ()))
+    given = dict(map(_fit_setting, fit_settings or ()))
+    wanted = None if fit is None else FitRequest(fit, given, along)
+    return ScanRequest(tuple(name for name in names or () if name), wanted)
+
+
+def _fit_setting(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise ConfigError(Problem(f"'{clean(text)}' has no value", "--fit-set", expected="NAME=VALUE"))
+    return name.strip(), value.strip()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,12 +73,12 @@ class ScanReport:
     Attributes:
         scan: The points.
         values: Each quantity with its mean at each point.
-        fits: The fit of each quantity; empty without.
+        fits: The fits of each quantity, at each combination of the other axes; empty without.
     """
 
     scan: Scanned
     values: tuple[tuple[Quantity, list[Estimated]], ...]
-    fits: tuple[Fit, ...] = ()
+    fits: tuple[list[FitAt], ...] = ()
 
     def as_text(self) -> list[str]:
         """A map for each quantity if all pairs of two values were scanned, else a table; then the fits."""
@@ -204,7 +91,7 @@ class ScanReport:
             tables = self.table()
         if not axes:
             tables = ["the run has no scan: these are all its shots", "", *tables]
-        return [*tables, *(line for fit in self.fits for line in ("", *fit.lines()))]
+        return [*tables, *(line for fits in self.fits for line in ("", *fit_lines(fits)))]
 
     def table(self, most: int = 0) -> list[str]:
         """A row for each point.
@@ -249,7 +136,10 @@ class ScanReport:
             for i, point in enumerate(self.scan.points)
         ]
         names = [quantity.name for quantity, _ in self.values]
-        fits = dict(zip(names, self.fits, strict=False))
+        fits = {
+            name: fits if fits[0].values else fits[0].fit
+            for name, fits in zip(names, self.fits, strict=False)
+        }
         return {"points": points} | ({"fits": fits} if fits else {})
 
     def columns(self, units: Mapping[str, str]) -> list[Column]:
@@ -294,9 +184,8 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
     for quantity, means in values if request.names else ():
         if all(math.isnan(mean.value) for mean in means):
             raise ConfigError(Problem(f"no shot has a value of '{quantity.name}'", clean(run.path.name)))
-    fits = (
-        tuple(_fit(run, scan, quantity, means, request) for quantity, means in values) if request.fit else ()
-    )
+    fit = request.fit
+    fits = () if fit is None else tuple(fits_along(run, scan, quantity, fit) for quantity in quantities)
     return ScanReport(scan, values, fits)
 
 
@@ -306,33 +195,20 @@ def _aim(run: Run) -> tuple[str, ...]:
     return (name,) if name and name not in {*DEFAULT, "filling_fraction", "success"} else ()
 
 
-def _fit(
-    run: Run, scan: Scanned, quantity: Quantity, values: Sequence[Estimated], request: ScanRequest
-) -> Fit:
-    on_axis = scan.on_axis(0) if len(scan.axes) == 1 else None
-    if on_axis is None:
-        raise ConfigError(
-            Problem("there is no axis to fit along", "--fit", expected="a scan of one numerical value")
-        )
-    x, unit = on_axis
-    parameters: dict[str, str] = {}
-    for setting in request.fit_settings:
-        name, equals, value = setting.partition("=")
-        if not equals:
-            raise ConfigError(Problem(f"'{clean(setting)}' has no value", "--fit-set", expected="NAME=VALUE"))
-        parameters[name.strip()] = value.strip()
-    profile: Mapping[str, Any] = (run.record.get("resolved") or {}).get("profile") or {}
-    units = si_unit_of(f"1 {unit}"), "%" if quantity.is_fraction else quantity.unit
-    factor = factor_of(unit)
-    assert request.fit is not None
-    return fit_points(
-        request.fit,
-        [factor * number for number in x],
-        values,
-        units,
-        parameters,
-        profile.get("simulation") or {},
-    )
+def fit_lines(fits: Sequence[FitAt]) -> list[str]:
+    """A fit with a line for each parameter; several as a table, with the reasons of those that failed."""
+    made = [at.fit for at in fits if at.fit is not None]
+    if not fits[0].values:
+        return made[0].lines()
+    names = list(dict.fromkeys(name for fit in made for name in fit.free))
+    rows = [(*fits[0].written, *names, "chi-square")]
+    for at in fits:
+        results = ["-"] * (len(names) + 1)
+        if at.fit is not None:
+            results = [str(at.fit.parameters[name]) for name in names] + [f"{at.fit.reduced_chi_square:.2f}"]
+        rows.append((*at.written.values(), *results))
+    failed = [f"{', '.join(at.written.values())}: {at.problem}" for at in fits if at.problem]
+    return [f"fit {made[0].model}: {made[0].formula}", *aligned(rows, right=range(len(rows[0]))), *failed]
 
 
 def title_of(quantity: Quantity) -> str:

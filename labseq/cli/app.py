@@ -19,6 +19,7 @@ from labseq.bench.commands import bench
 from labseq.calibration.commands import CALIBRATE_EXAMPLES, calibrate, calibration
 from labseq.campaigns.commands import campaign
 from labseq.console.options import (
+    Along,
     DryRun,
     FitName,
     FitSettings,
@@ -317,6 +318,7 @@ def show(
     where: Where = None,
     fit: FitName = None,
     fit_set: FitSettings = None,
+    along: Along = None,
     devices: Annotated[
         bool, typer.Option("--devices", help="Print how each device described itself.")
     ] = False,
@@ -329,7 +331,7 @@ def show(
     from labseq.analysis.scanned import scan_request
     from labseq.cli.show import Tables, show_run
 
-    wanted = scan_request(scan, fit, fit_set)
+    wanted = scan_request(scan, fit, fit_set, along)
     show_run(run, as_json=as_json, tables=Tables(shots, timing, wanted, devices), where=where)
 
 

@@ -14,7 +14,6 @@ from labseq.analysis.scanned import (
     counted_text,
     rate_text,
     scan_report,
-    scanned,
     share_text,
     title_of,
     value_text,
@@ -26,6 +25,7 @@ from labseq.console.text import count_of, plural, quoted
 from labseq.data import Run
 from labseq.data.best import BestPoint, best_point
 from labseq.data.follower import Follower
+from labseq.data.scanned import scanned
 from labseq.errors import StopRequested
 from labseq.messages import clean
 from labseq.model.estimate import Estimate, mean

@@ -220,8 +220,17 @@ FitName = Annotated[
     typer.Option(
         "--fit",
         metavar="MODEL",
-        help="Fit the quantity against the scanned value: exponential, gaussian, lorentzian, linear, "
-        "saturation, step, plateau, lowering or release_recapture.",
+        help="Fit the quantity against the scanned value: exponential, double_exponential, damped_cosine, "
+        "gaussian, lorentzian, linear, polynomial, saturation, step, plateau, lowering, release_recapture or "
+        "one of a plugin.",
+    ),
+]
+Along = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="In a scan of several values, the one that the fit is along, at each of the others; default: "
+        "the first.",
     ),
 ]
 FitSettings = Annotated[

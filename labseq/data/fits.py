@@ -51,7 +51,7 @@ class Parameter:
             >>> str(Parameter(0.97, 0.01, "%")), str(Parameter(-4e3, 1e2, "%/s"))
             ('97(1) %', '-400(10) %/ms')
         """
-        unit, factor = _readable(self.value, self.text_unit)
+        unit, factor = readable(self.value, self.text_unit)
         text = f"{Estimate(self.value, self.error).scaled(1 / factor)} {unit}".rstrip()
         return text if self.error else f"{text} (fixed)"
 
@@ -60,7 +60,7 @@ class Parameter:
         return {"value": self.value, "error": self.error, "unit": self.unit}
 
 
-def _readable(value: float, unit: str) -> tuple[str, float]:
+def readable(value: float, unit: str) -> tuple[str, float]:
     """A unit in which an SI value is readable, and its factor to SI."""
     dimension = dimension_of(unit)
     if dimension and dimension != "fraction":

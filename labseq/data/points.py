@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,6 +79,20 @@ def completed(scan: Mapping[str, Any], rows: Iterable[IndexRow]) -> dict[str, An
         of_shot[row.shot] = points.number(row.parameters)
     point_of_shot = [of_shot.get(shot, -1) for shot in range(max(of_shot, default=-1) + 1)]
     return {**scan, "points": points.points, "written": points.written, "point_of_shot": point_of_shot}
+
+
+def restricted(scan: Mapping[str, Any], shots: Collection[int]) -> dict[str, Any]:
+    """The record of a scan with the points of some shots only; the others have point -1."""
+    of_shot: Sequence[int] = scan["point_of_shot"]
+    kept = sorted({of_shot[shot] for shot in shots})
+    number = {point: i for i, point in enumerate(kept)}
+    points = [number[point] if shot in shots else -1 for shot, point in enumerate(of_shot)]
+    return {
+        **scan,
+        "points": [scan["points"][point] for point in kept],
+        "written": [scan["written"][point] for point in kept],
+        "point_of_shot": points,
+    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
+    from labseq.data.fits import Fit
     from labseq.data.quantities import Quantity
+    from labseq.data.scanned import FitAt
 
 
 def open_run(path: str | Path) -> Run:
@@ -218,7 +220,70 @@ class Run:
         shots = select_shots(self, conditions)
         if not shots:
             raise ConfigError(Problem(f"no shot meets {' and '.join(conditions)}", clean(self.path.name)))
-        return replace(self, shots=shots, attempts=())
+        scan = self.record.get("scan") or {}
+        if scan and SCANNER not in scan:
+            from labseq.data.points import reporting_damage, restricted
+
+            with reporting_damage(self.path):
+                scan = restricted(scan, {shot.index for shot in shots})
+        return replace(self, record={**self.record, "scan": scan}, shots=shots, attempts=())
+
+    def fit(
+        self,
+        quantity: str,
+        model: str,
+        *,
+        where: Sequence[str] = (),
+        fixed: Mapping[str, str | float] | None = None,
+        free: Sequence[str] = (),
+        along: str | None = None,
+    ) -> Fit:
+        """Fit a quantity of the shots against the scanned value.
+
+        Args:
+            quantity: Its name, see :meth:`quantity`.
+            model: Name of the model, as of ``labseq show --fit``.
+            where: Conditions on the shots, see :meth:`select`. In a scan of several values they choose one
+                value of each of the others; :meth:`fits` fits at all of them.
+            fixed: Parameter -> the value at which it is fixed: a number in SI, or text with a unit.
+            free: Parameters to fit that the model fixes otherwise.
+            along: Scanned address to fit along; by default the first.
+
+        Raises:
+            ConfigError: There is no such quantity or model, or the points do not determine the parameters.
+
+        Example:
+            ``run.fit("survival:before,after", "exponential").parameters["decay"].value`` is in seconds.
+        """
+        fits = self.fits(quantity, model, where=where, fixed=fixed, free=free, along=along)
+        if len(fits) > 1:
+            others = " and ".join(fits[0].values)
+            problem = f"there are {len(fits)} values of {others} to fit at"
+            expected = "one, chosen by 'where'; or fits()"
+            raise ConfigError(Problem(problem, clean(self.path.name), expected=expected))
+        assert fits[0].fit is not None  # otherwise it has raised
+        return fits[0].fit
+
+    def fits(
+        self,
+        quantity: str,
+        model: str,
+        *,
+        where: Sequence[str] = (),
+        fixed: Mapping[str, str | float] | None = None,
+        free: Sequence[str] = (),
+        along: str | None = None,
+    ) -> list[FitAt]:
+        """Fit a quantity along one axis of a scan, at each combination of the values of the others.
+
+        Arguments and errors are those of :meth:`fit`; where some of the fits fail, the results say why.
+        """
+        from labseq.data.scanned import FitRequest, Scanned, fits_along, scanned
+
+        run = self.select(*where)
+        given = {**(fixed or {}), **dict.fromkeys(free, "free")}
+        scan = scanned(run) or Scanned((), (), ())
+        return fits_along(run, scan, run.quantity(quantity), FitRequest(model, given, along))
 
     def summary(self) -> dict[str, Any]:
         """The main results of the run, JSON-ready; None for a missing number."""

@@ -13,7 +13,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, cast
 
-from labseq.analysis.scanned import Scanned, scanned
 from labseq.analysis.timing import StageTotals
 from labseq.calibration_store import read_entry
 from labseq.console.events import event_text, point_of_shot
@@ -21,6 +20,7 @@ from labseq.console.text import age_text, percent, plural, size_text
 from labseq.data import Shot, open_run
 from labseq.data.follower import Event
 from labseq.data.points import ScanPoint
+from labseq.data.scanned import Scanned, scanned
 from labseq.errors import LabseqError, RecordingError
 from labseq.model import StageTiming
 from labseq.model.estimate import Rate, mean

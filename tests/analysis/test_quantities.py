@@ -11,7 +11,6 @@ import pytest
 from labseq_virtual.flight import KELVIN, draw_atoms
 
 import labseq
-from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.cli import main
 from labseq.data.fit_models import MODELS, RB87_U
 from labseq.data.fits import fit_points
@@ -111,7 +110,7 @@ def test_a_lifetime_scan_gives_the_lifetime_of_the_profile(lifetime: labseq.Run)
 
 
 def test_release_and_recapture_gives_the_temperature_of_the_profile(recapture: labseq.Run) -> None:
-    (fit,) = scan_report(recapture, ScanRequest(("survival:before,after",), fit="release_recapture")).fits
+    fit = recapture.fit("survival:before,after", "release_recapture")
     temperature = fit.parameters["temperature"]
     assert abs(temperature.value - 15e-6) < 2.5 * temperature.error < 2e-6
     assert 0.2 < fit.reduced_chi_square < 3

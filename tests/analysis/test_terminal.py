@@ -14,6 +14,7 @@ from labseq.analysis.overview import scan_picture
 from labseq.analysis.replay import ReplayRequest
 from labseq.analysis.scanned import ScanRequest
 from labseq.analysis.terminal import analyse_run, replay_run
+from labseq.data.scanned import FitRequest
 from labseq.errors import ConfigError
 
 SEQUENCE = """labseq: 1
@@ -128,8 +129,8 @@ def test_quantities_need_neither_analysis_nor_scan(run, capsys):
         "shots  loading",
         f"    2  {expected} %",
     ]
-    with pytest.raises(ConfigError, match="there is no axis to fit along; expected a scan of one"):
-        analyse_run(run.path, None, [], ScanRequest(fit="linear"), again=False)
+    with pytest.raises(ConfigError, match="there is no axis to fit along; expected a scan of a num"):
+        analyse_run(run.path, None, [], ScanRequest(fit=FitRequest("linear", {})), again=False)
     with pytest.raises(ConfigError, match=r"it has no scan; expected .*`labseq show --scan` prints"):
         scan_picture(run, ScanRequest())
 

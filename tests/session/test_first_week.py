@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.session.check import check
 
 from .whole_runs import SMALL_FRAMES
@@ -47,8 +46,8 @@ def test_the_fitted_value_is_that_of_the_simulation(
         sequence, seed=3, output=tmp_path, overrides=["repeats=1", *SMALL_FRAMES]
     ) as session:
         run = session.run()
-    given = ("centre=0",) if name == "hand_over_ramp" else ()
-    (found,) = scan_report(run, ScanRequest((quantity,), fit=fit, fit_settings=given)).fits
+    given = {"centre": 0.0} if name == "hand_over_ramp" else {}
+    found = run.fit(quantity, fit, fixed=given)
     value = found.parameters[parameter]
     assert abs(value.value - true) < 3 * value.error + tolerance
     assert value.error < 0.25 * abs(true) + tolerance

@@ -1,0 +1,241 @@
+"""The axes of a scan, quantities at its points, and fits along an axis."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from labseq.data.fits import Fit, fit_points
+from labseq.data.points import ScanPoint, scan_points
+from labseq.data.quantities import Quantity
+from labseq.data.reader import Run
+from labseq.errors import ConfigError, Problem
+from labseq.messages import clean, did_you_mean, listing
+from labseq.model.estimate import Estimated
+from labseq.units import dimension_of, factor_of, scaled, si_unit_of, split_quantity
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """A scanned address and its values.
+
+    Attributes:
+        address: The address, and those that change together with it.
+        labels: Its different values as written, in the order of the scan.
+        numbers: The same as numbers, and the unit of these; None if they are not numbers of one dimension.
+    """
+
+    address: str
+    labels: tuple[str, ...]
+    numbers: tuple[tuple[float, ...], str] | None
+
+    def value(self, number: int) -> float | str:
+        """One of its values, SI; as written if it is not a number."""
+        if self.numbers is None:
+            return self.labels[number]
+        return scaled(self.numbers[0][number], factor_of(self.numbers[1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scanned:
+    """The points of a scan.
+
+    Attributes:
+        axes: Independent addresses, the slowest first.
+        places: Index of each point's value on each axis.
+        points: The points, with their shots.
+    """
+
+    axes: tuple[Axis, ...]
+    places: tuple[tuple[int, ...], ...]
+    points: tuple[ScanPoint, ...]
+
+    @property
+    def is_map(self) -> bool:
+        """Whether there are two axes or more, and most combinations of their values have a point."""
+        n_cells = math.prod(len(axis.labels) for axis in self.axes)
+        return len(self.axes) > 1 and len({*self.places}) >= n_cells / 2
+
+    def over(self, quantity: Quantity) -> list[Estimated]:
+        """The mean of a quantity at each point."""
+        return [quantity.over(point.shots) for point in self.points]
+
+    def on_axis(self, number: int) -> tuple[list[float], str] | None:
+        """Each point's value on an axis, and the unit that it is written in; None if they are not numbers."""
+        numbers = self.axes[number].numbers
+        if numbers is None:
+            return None
+        return [numbers[0][place[number]] for place in self.places], numbers[1]
+
+
+def scanned(run: Run) -> Scanned | None:
+    """The points of a run's scan that have shots; None without a scan.
+
+    Raises:
+        RecordingError: The scan in run.json is damaged.
+    """
+    points = scan_points(run)
+    if not points or not points[0].parameters:  # --set may have replaced every address
+        return None
+    rows = [tuple(map(clean, row)) for row in run.scan["written"]]
+    columns, values = list(zip(*rows, strict=True)), list(zip(*run.scan["points"], strict=True))
+    numbers = [_numbers(*pair) for pair in zip(values, columns, strict=True)]
+    addresses = list(map(clean, points[0].written))
+    # an axis at least, even if all points have the same value
+    varied = [i for i, column in enumerate(columns) if len({*column}) > 1] or [0]
+    together: dict[int, list[str]] = {}
+    # addresses that change together share an axis
+    for i in varied:
+        leader = next((k for k in together if _follows(columns, numbers, i, k)), i)
+        together.setdefault(leader, []).append(addresses[i])
+    axes = tuple(make_axis(" with ".join(names), columns[i], values[i]) for i, names in together.items())
+    written = [tuple(map(clean, point.written.values())) for point in points]
+    places = tuple(
+        tuple(axis.labels.index(row[i]) for axis, i in zip(axes, together, strict=True)) for row in written
+    )
+    return Scanned(axes, places, tuple(points))
+
+
+def make_axis(address: str, labels: Sequence[str], values: Sequence[Any]) -> Axis:
+    """An axis from the labels and values, SI, of its points, of which some may be equal."""
+    value_of_label = dict(zip(labels, values, strict=True))
+    return Axis(address, tuple(value_of_label), _numbers([*value_of_label.values()], [*value_of_label]))
+
+
+def _follows(
+    columns: Sequence[Sequence[str]], numbers: Sequence[tuple[Sequence[float], str] | None], i: int, k: int
+) -> bool:
+    """Whether the values of address i change together with those of address k, and not by chance.
+
+    No two points of an optimiser share a value; numbers must then rise or fall together.
+    """
+    leader, own_numbers, leader_numbers = columns[k], numbers[i], numbers[k]
+    if len({*zip(columns[i], leader, strict=True)}) > len({*leader}):
+        return False
+    if len({*leader}) < len(leader) or own_numbers is None or leader_numbers is None:
+        return True
+    steps = np.diff(np.array(own_numbers[0])[np.argsort(leader_numbers[0], kind="stable")])
+    return bool((steps >= 0).all() or (steps <= 0).all())
+
+
+def _numbers(values: Sequence[Any], written: Sequence[str]) -> tuple[tuple[float, ...], str] | None:
+    """Values as numbers in the unit of the largest, and that unit; None unless they have one dimension."""
+    if not all(type(value) in (int, float) for value in values):
+        return None
+    units = [split_quantity(text)[1] for text in written]
+    if len({dimension_of(unit) for unit in units}) > 1:
+        return None
+    unit = units[int(np.argmax(np.abs(values)))]
+    # without the rounding error of the division: 0.3 ms, not 0.30000000000000004 ms
+    return tuple(float(f"{value / factor_of(unit):.12g}") for value in values), re.sub(
+        r"\bu(?=[msVWK]\b)", "µ", unit
+    )
+
+
+def is_geometric(values: Sequence[float]) -> bool:
+    """Whether rising values have nearly equal ratios, over a wide range."""
+    if len(values) < 3 or values[0] <= 0 or values[-1] < 20 * values[0]:
+        return False
+    steps = np.diff(np.log(values))
+    return float(np.ptp(steps)) <= 0.5 * float(steps.mean())  # "1, 2, 5, 10" passes
+
+
+@dataclass(frozen=True, slots=True)
+class FitRequest:
+    """A fit along an axis of a scan.
+
+    Attributes:
+        model: Name of the model.
+        given: Parameter -> its value, with a unit if it is text, at which it is fixed; or "free".
+        along: Scanned address to fit along; None for the first axis.
+    """
+
+    model: str
+    given: Mapping[str, str | float]
+    along: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitAt:
+    """The fit at one combination of the values of the other axes.
+
+    Attributes:
+        values: Address of each other axis -> its value there, SI if it is a number.
+        written: The same in the units of the sequence.
+        fit: The fit; None if it failed.
+        problem: Why it failed, or "".
+    """
+
+    values: Mapping[str, Any]
+    written: Mapping[str, str]
+    fit: Fit | None
+    problem: str
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-ready, SI."""
+        result = {"error": self.problem} if self.fit is None else self.fit.as_json()
+        return {"at": dict(self.values), **result}
+
+
+def fits_along(run: Run, scan: Scanned, quantity: Quantity, request: FitRequest) -> list[FitAt]:
+    """Fit a quantity along one axis, at each combination of the values of the others.
+
+    Raises:
+        ConfigError: There is no such axis, or no fit can be made.
+    """
+    i_along = _axis_number(scan, request.along)
+    means = scan.over(quantity)
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for i, place in enumerate(scan.places):
+        groups.setdefault((*place[:i_along], *place[i_along + 1 :]), []).append(i)
+    others = [axis for axis in scan.axes if axis is not scan.axes[i_along]]
+    numbers, unit = scan.on_axis(i_along) or ([], "")
+    x = [factor_of(unit) * number for number in numbers]
+    profile: Mapping[str, Any] = (run.record.get("resolved") or {}).get("profile") or {}
+    fits: list[FitAt] = []
+    errors: list[ConfigError] = []
+    for place, members in sorted(groups.items()):
+        fit, problem = None, ""
+        try:
+            fit = fit_points(
+                request.model,
+                [x[i] for i in members],
+                [means[i] for i in members],
+                (si_unit_of(f"1 {unit}"), "%" if quantity.is_fraction else quantity.unit),
+                request.given,
+                profile.get("simulation") or {},
+            )
+        except ConfigError as error:
+            errors.append(error)
+            problem = "; ".join(problem.what for problem in error.problems)
+        at = list(zip(others, place, strict=True))
+        values = {axis.address: axis.value(i) for axis, i in at}
+        fits.append(FitAt(values, {axis.address: axis.labels[i] for axis, i in at}, fit, problem))
+    if errors and len(errors) == len(fits):
+        raise errors[0]
+    return fits
+
+
+def _axis_number(scan: Scanned, address: str | None) -> int:
+    """The number of the axis to fit along.
+
+    Raises:
+        ConfigError: There is none, or its values are not numbers.
+    """
+    addresses = [axis.address for axis in scan.axes]
+    if address is not None and address not in addresses:
+        hint = did_you_mean(address, addresses)
+        problem = f"the scan has no axis '{clean(address)}'"
+        raise ConfigError(Problem(problem, "--along", expected=listing(addresses), hint=hint))
+    number = 0 if address is None else addresses.index(address)
+    if not addresses or scan.on_axis(number) is None:
+        numerical = [axis.address for axis in scan.axes if axis.numbers is not None]
+        hint = f"--along {numerical[0]} fits along another axis" if numerical else ""
+        expected = "a scan of a numerical value"
+        raise ConfigError(Problem("there is no axis to fit along", "--fit", expected=expected, hint=hint))
+    return number

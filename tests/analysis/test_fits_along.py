@@ -1,0 +1,79 @@
+"""Fits of a scan of two values, at each value of the second."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+import labseq
+from labseq.analysis.overview import scan_picture
+from labseq.analysis.scanned import ScanRequest, scan_report
+from labseq.data.scanned import FitRequest
+from labseq.errors import ConfigError
+
+from .conftest import LIFETIME, run_text
+
+SURVIVAL = "survival:before,after"
+TIME, VACUUM = "shot.hold.duration", "profile.simulation.lifetime"
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> labseq.Run:
+    """A scan of the time in the tweezers and of the vacuum's lifetime in the virtual lab."""
+    text = LIFETIME.replace("repeats: 2", f"  {VACUUM}: [10 s, 33 s]\nrepeats: 1")
+    return run_text(text, tmp_path_factory.mktemp("two"), seed=4)
+
+
+def test_the_first_value_is_fitted_at_each_of_the_second(two: labseq.Run) -> None:
+    report = scan_report(two, ScanRequest((SURVIVAL,), FitRequest("exponential", {})))
+    (fits,) = report.fits
+    assert [at.values for at in fits] == [{VACUUM: 10.0}, {VACUUM: 33.0}]
+    for at in fits:
+        assert at.fit is not None
+        decay = at.fit.parameters["decay"]
+        assert abs(decay.value - at.values[VACUUM]) < 3 * decay.error < 10
+    *_, header, first, second = report.as_text()
+    assert header.split() == [VACUUM, "amplitude", "decay", "chi-square"]
+    assert [line.split()[:2] for line in (first, second)] == [["10", "s"], ["33", "s"]]
+    answer: Any = report.as_json()["fits"][SURVIVAL]
+    assert answer[1].as_json()["at"] == {VACUUM: 33.0}
+    titles = [panel.keywords["title"] for row in picture_rows(two) for panel in row]
+    assert titles[-2:] == ["amplitude of the exponential fits", "decay of the exponential fits"]
+
+
+def picture_rows(run: labseq.Run) -> Any:
+    picture = scan_picture(run, ScanRequest((SURVIVAL,), FitRequest("exponential", {})))
+    picture.draw()
+    return picture.rows
+
+
+def test_a_condition_chooses_one_value_and_the_fit_is_that_of_one_axis(two: labseq.Run) -> None:
+    fit = two.fit(
+        SURVIVAL, "exponential", where=[f"{VACUUM} == 33 s"], free=["offset"], fixed={"amplitude": 1}
+    )
+    assert fit.parameters["offset"].error > 0
+    assert fit.parameters["amplitude"].error == 0
+    at_33 = two.fits(SURVIVAL, "exponential")[1].fit
+    assert at_33 is not None
+    assert two.select(f"{VACUUM} == 33 s").fit(SURVIVAL, "exponential").as_json() == at_33.as_json()
+    with pytest.raises(ConfigError, match=f"there are 2 values of {VACUUM} to fit at"):
+        two.fit(SURVIVAL, "exponential")
+
+
+def test_along_chooses_the_axis_and_a_failed_fit_leaves_the_others(two: labseq.Run) -> None:
+    with pytest.raises(ConfigError, match="2 points are too few for a fit of 2 parameters"):
+        two.fits(SURVIVAL, "exponential", along=VACUUM)
+    with pytest.raises(ConfigError, match=f"no axis 'shot.hold.duratoin'.*did you mean '{TIME}'"):
+        two.fits(SURVIVAL, "exponential", along="shot.hold.duratoin")
+    at_10 = [shot for shot in two.shots if shot.parameters[VACUUM] == 10]
+    one_left = [f"shot != {shot.index}" for shot in at_10[1:]]
+    fits = two.fits(SURVIVAL, "exponential", where=one_left)
+    bad, good = sorted(fits, key=lambda at: at.values[VACUUM])
+    assert bad.fit is None
+    assert bad.problem.startswith("1 points are too few")
+    assert good.fit is not None
+    assert math.isfinite(good.fit.reduced_chi_square)
+    request = ScanRequest((SURVIVAL,), FitRequest("exponential", {}))
+    assert scan_report(two.select(*one_left), request).as_text()[-1] == f"10 s: {bad.problem}"
