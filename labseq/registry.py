@@ -61,7 +61,7 @@ class Entry:
     """One thing that a plugin offers.
 
     Attributes:
-        kind: Name of its role, one of :data:`labseq.roles.ROLES`.
+        kind: Name of its role, one of :data:`labseq.roles.ROLES`; or "fit".
         name: The name that a sequence or profile uses.
         factory: ``factory(settings, context)``; steps: ``factory(settings)``;
             patterns: ``factory(settings, grid)``; scanners: ``factory(settings, space)``.
@@ -78,6 +78,7 @@ class Entry:
             that returns them, or a text: why the device cannot be simulated on this computer.
         owner: The plugin that registered it.
         no_simulator: Why the device cannot be simulated on this computer; "" if it can.
+        units: Units of the parameters of a fit, see :meth:`Registry.fit`.
     """
 
     kind: str
@@ -89,6 +90,7 @@ class Entry:
     simulated: Mapping[str, Any] | None = None
     owner: Owner = field(default=Owner("labseq"), compare=False, repr=False)
     no_simulator: str = ""
+    units: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @property
     def role(self) -> Role:
@@ -144,6 +146,7 @@ class Registry:
         *,
         virtual_time: bool = False,
         simulated: Mapping[str, Any] | str | None = None,
+        units: Mapping[str, str] | None = None,
     ) -> None:
         fault = self._owner.fault
         if not isinstance(name, str) or not name:  # pyright: ignore[reportUnnecessaryIsInstance]
@@ -168,6 +171,7 @@ class Registry:
             raise error
         parts: tuple[Any, Any, Any] = factory, settings_model, simulated
         entry = Entry(kind, name, *parts[:2], self._owner.name, virtual_time, parts[2], self._owner)
+        entry = replace(entry, units=units or {})
         if not entry.is_place:
             _check(entry)
         self._entries[kind, name] = entry
@@ -204,6 +208,17 @@ class Registry:
     def analysis(self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None) -> None:
         """Offer an analysis of shots: ``factory(settings, context) -> Analysis``."""
         self._add("analysis", name, factory, settings_model)
+
+    def fit(self, name: str, factory: FactoryOrPlace, units: Mapping[str, str] | None = None) -> None:
+        """Offer a model to ``--fit``: ``factory() -> lmfit.Model``. It plays no role in a run.
+
+        Args:
+            name: Its name.
+            factory: Makes the model, or the place of what does.
+            units: Parameter -> its unit: "x" or "y" for those of the scanned value and of the quantity,
+                "1/x", "y/x" or an SI unit.
+        """
+        self._add("fit", name, factory, None, units=units)
 
     def camera(
         self, name: str, factory: FactoryOrPlace, settings_model: ModelOrPlace = None, **options: Any
@@ -263,7 +278,7 @@ class Registry:
     def offers(self, origin: str | None = None) -> list[tuple[str, str]]:
         """Kind and name of all entries, or of those of one plugin, sorted; nothing is imported."""
         keys = [key for key, entry in self._entries.items() if origin in (None, entry.origin)]
-        order = [*ROLES]
+        order = [*ROLES, "fit"]
         return sorted(keys, key=lambda key: (order.index(key[0]), key[1]))
 
     def entries(self, origin: str | None = None) -> list[Entry]:

@@ -163,6 +163,7 @@ def plot(
     fit_set: FitSettings = None,
     along: Along = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file of --output.")] = False,
+    _plugins: Plugins = None,
 ) -> None:
     """Draw a run, finished or not: an overview, one part of it, the points of a scan, or a shot.
 

@@ -323,6 +323,7 @@ def show(
         bool, typer.Option("--devices", help="Print how each device described itself.")
     ] = False,
     as_json: Json = False,
+    _plugins: Plugins = None,
 ) -> None:
     """Show what a run has recorded, finished or not: its summary, or the tables that you choose.
 

@@ -73,7 +73,7 @@ class Solution:
     function: Callable[[Floats], Floats]
 
     @property
-    def values_only(self) -> dict[str, float]:
+    def start(self) -> dict[str, float]:
         """Parameter -> its value."""
         return {name: value.value for name, value in self.values.items()}
 
@@ -123,7 +123,7 @@ class FitModel:
             return (self.evaluate(points.x, **fixed, **parameters) - points.y) / points.error
 
         with np.errstate(all="ignore"):  # a trial may leave the range of the function
-            start = self.guess(points.x, points.y) if near is None else near.values_only
+            start = self.guess(points.x, points.y) if near is None else near.start
             minimum = minimise(
                 residuals,
                 np.array([start[name] for name in free]),

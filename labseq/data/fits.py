@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +16,11 @@ from labseq.errors import ConfigError, Problem, one_of
 from labseq.messages import clean, did_you_mean
 from labseq.model.estimate import Estimate, Estimated
 from labseq.units import UNITS, dimension_of, parse_any, readable_unit
+
+if TYPE_CHECKING:
+    from labseq.data.lab_models import LabModel  # with the plugins, it takes a while to import
+
+    Model: TypeAlias = FitModel | LabModel
 
 ROUNDING: Final = 1e-9
 """Relative error below which a value counts as without error."""
@@ -145,17 +150,6 @@ class Fit:
         }
 
 
-def find_model(name: str) -> FitModel:
-    """A model by name.
-
-    Raises:
-        ConfigError: There is none.
-    """
-    if name not in MODELS:
-        raise _problem(f"there is no fit '{clean(name)}'", one_of([*MODELS]), did_you_mean(name, MODELS))
-    return MODELS[name]
-
-
 def fit_points(
     name: str,
     x: Sequence[float],
@@ -163,6 +157,7 @@ def fit_points(
     units: tuple[str, str],
     given: Mapping[str, str | float] | None = None,
     settings: Mapping[str, Any] | None = None,
+    lab_model: LabModel | None = None,
 ) -> Fit:
     """Fit a model to points, weighted with their errors.
 
@@ -173,11 +168,12 @@ def fit_points(
         units: SI units of both; "%" for a fraction.
         given: Parameter -> its value, with a unit if it is text, at which it is fixed; or "free".
         settings: Settings of the profile's simulation.
+        lab_model: The model of a plugin, if it is none of labseq's.
 
     Raises:
         ConfigError: There are too few points, a parameter is missing, or the fit fails; says which.
     """
-    model = find_model(name)
+    model = MODELS[name] if lab_model is None else lab_model
     points, fixed = _points(x, values), _fixed(model, given or {}, settings or {})
     points, solution = _solve_determined(model, points, fixed, {*(given or {})})
     parameters = {
@@ -216,7 +212,7 @@ def _points(x: Sequence[float], values: Sequence[Estimated]) -> Points:
 
 
 def _solve_determined(
-    model: FitModel, points: Points, fixed: Mapping[str, float], given: Collection[str]
+    model: Model, points: Points, fixed: Mapping[str, float], given: Collection[str]
 ) -> tuple[Points, Solution]:
     """Fit, if need be without the parameters that the model can do without."""
     try:
@@ -228,7 +224,7 @@ def _solve_determined(
         return _solve(model, points, {**fixed, **without})
 
 
-def _solve(model: FitModel, points: Points, fixed: Mapping[str, float]) -> tuple[Points, Solution]:
+def _solve(model: Model, points: Points, fixed: Mapping[str, float]) -> tuple[Points, Solution]:
     """Fit, with rates weighted by the errors that the fit itself expects.
 
     Where few of few atoms survive by chance, the error seems smaller than where many do, and such points
@@ -246,7 +242,7 @@ def _solve(model: FitModel, points: Points, fixed: Mapping[str, float]) -> tuple
     return points, solution
 
 
-def _check_number(model: FitModel, points: Points, fixed: Mapping[str, float]) -> None:
+def _check_number(model: Model, points: Points, fixed: Mapping[str, float]) -> None:
     free = [name for name in model.units if name not in fixed]
     if not free:
         raise _problem("all parameters are fixed", "at least one to fit")
@@ -274,7 +270,7 @@ def _within_a_turn(parameter: Parameter) -> Parameter:
     return replace(parameter, value=math.remainder(parameter.value, math.tau))
 
 
-def _check_determined(model: FitModel, values: Mapping[str, Estimate], points: Points) -> None:
+def _check_determined(model: Model, values: Mapping[str, Estimate], points: Points) -> None:
     """Refuse parameters with an error far larger than the range of the points, or that noise has as well."""
     undetermined = [
         name
@@ -289,9 +285,7 @@ def _check_determined(model: FitModel, values: Mapping[str, Estimate], points: P
             raise _problem(f"{name} cannot be told from noise", model.advice)
 
 
-def _fixed(
-    model: FitModel, given: Mapping[str, str | float], settings: Mapping[str, Any]
-) -> dict[str, float]:
+def _fixed(model: Model, given: Mapping[str, str | float], settings: Mapping[str, Any]) -> dict[str, float]:
     """The parameters that are not fitted."""
     fixed = dict(model.fixed)
     keys = {"depth": "static_depth", "waist": "static_waist", "wavelength": "static_wavelength"}

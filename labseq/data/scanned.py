@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from labseq.data.fit_models import MODELS
 from labseq.data.fits import Fit, fit_points
 from labseq.data.points import ScanPoint, scan_points
 from labseq.data.quantities import Quantity
@@ -197,6 +198,11 @@ def fits_along(run: Run, scan: Scanned, quantity: Quantity, request: FitRequest)
     numbers, unit = scan.on_axis(i_along) or ([], "")
     x = [factor_of(unit) * number for number in numbers]
     profile: Mapping[str, Any] = (run.record.get("resolved") or {}).get("profile") or {}
+    lab_model = None
+    if request.model not in MODELS:
+        from labseq.data.lab_models import find_lab_model  # loading plugins takes a while
+
+        lab_model = find_lab_model(run, request.model)
     fits: list[FitAt] = []
     errors: list[ConfigError] = []
     for place, members in sorted(groups.items()):
@@ -209,6 +215,7 @@ def fits_along(run: Run, scan: Scanned, quantity: Quantity, request: FitRequest)
                 (si_unit_of(f"1 {unit}"), "%" if quantity.is_fraction else quantity.unit),
                 request.given,
                 profile.get("simulation") or {},
+                lab_model,
             )
         except ConfigError as error:
             errors.append(error)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
+import lmfit
 import pytest
 
 import labseq
@@ -77,3 +79,99 @@ def test_along_chooses_the_axis_and_a_failed_fit_leaves_the_others(two: labseq.R
     assert math.isfinite(good.fit.reduced_chi_square)
     request = ScanRequest((SURVIVAL,), FitRequest("exponential", {}))
     assert scan_report(two.select(*one_left), request).as_text()[-1] == f"10 s: {bad.problem}"
+
+
+PLUGIN = """
+import threading
+
+import lmfit
+import numpy as np
+from labseq.plugin import hookimpl
+
+LABSEQ_API = 1
+
+
+def decays(t, lifetime, kept=1.0):
+    return kept * np.exp(-t / lifetime)
+
+
+def wrong(t, lifetime=1.0):
+    return np.zeros(3)
+
+
+def raises(t, lifetime=1.0):
+    return t / lifetime["s"]
+
+
+def model():
+    made = lmfit.Model(decays)
+    made.set_param_hint("lifetime", value=5.0, min=0.0)
+    made.set_param_hint("kept", vary=False)
+    return made
+
+
+def hangs(t, lifetime=1.0):
+    threading.Event().wait()
+    return t
+
+
+@hookimpl
+def labseq_register(registry):
+    registry.fit("own_decay", model, {"lifetime": "x", "kept": "y"})
+    registry.fit("own_peak", lmfit.models.GaussianModel, {"center": "x"})
+    registry.fit("own_start", lambda: lmfit.Model(decays))
+    registry.fit("own_wrong", lambda: lmfit.Model(wrong))
+    registry.fit("own_raise", lambda: lmfit.Model(raises))
+    registry.fit("own_hang", lambda: lmfit.Model(hangs))
+    registry.fit("own_none", lambda: 3)
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    assert lmfit.Model  # imported before, so that loading the plugin is quick
+    path = tmp_path / "own_fits.py"
+    path.write_text(PLUGIN, "utf-8")
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
+    return path
+
+
+def test_a_plugin_s_lmfit_model_is_fitted_by_its_name(lifetime: labseq.Run, plugin: Path) -> None:
+    own, labseqs = (
+        lifetime.fit(SURVIVAL, "own_decay"),
+        lifetime.fit(SURVIVAL, "exponential", fixed={"amplitude": 1}),
+    )
+    tau, expected = own.parameters["lifetime"], labseqs.parameters["decay"]
+    assert tau.unit == "s"
+    assert tau.value == pytest.approx(expected.value, rel=1e-3)
+    assert tau.error == pytest.approx(expected.error, rel=1e-2)
+    assert own.parameters["kept"].error == 0
+    assert own.residuals == pytest.approx(labseqs.residuals, abs=1e-3)
+    assert lifetime.fit(SURVIVAL, "own_decay", free=["kept"]).parameters["kept"].error > 0
+    with pytest.raises(ConfigError, match=r"there is no fit 'own_dcay'.*own_peak.*did you mean 'own_decay'"):
+        lifetime.fit(SURVIVAL, "own_dcay")
+
+
+@pytest.mark.parametrize(
+    ("model", "problem"),
+    [
+        (
+            "own_start",
+            "plugin 'own_fits': fit 'own_start' does not know where to start; write model.set_param_h",
+        ),
+        (
+            "own_wrong",
+            r"fit 'own_wrong' gives values of shape \(3,\) .* expected a number .*own_fits.py:15\)",
+        ),
+        ("own_raise", r"fit 'own_raise' raised TypeError: .*own_fits.py:20\)"),
+        ("own_hang", "fit 'own_hang' did not return within 2 s and was abandoned"),
+        ("own_none", "fit 'own_none' made a int, without fit; expected an lmfit.Model"),
+    ],
+)
+def test_a_plugin_s_model_that_is_wrong_is_named_in_one_line(
+    lifetime: labseq.Run, plugin: Path, monkeypatch: pytest.MonkeyPatch, model: str, problem: str
+) -> None:
+    monkeypatch.setattr("labseq.data.lab_models.MAX_WAIT_S", 2.0 if model == "own_hang" else 30.0)
+    with pytest.raises(ConfigError, match=problem) as caught:
+        lifetime.fit(SURVIVAL, model)
+    assert "\n" not in str(caught.value)
