@@ -17,8 +17,8 @@ from labseq.data.reader import Run
 from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError, one_of
 from labseq.messages import clean, did_you_mean
 from labseq.model.estimate import Estimate
-from labseq.plugins import PluginHost
 from labseq.plugins.calls import call_plugin
+from labseq.plugins.host import PluginHost
 from labseq.registry import Entry
 from labseq.settings import path_beside
 
