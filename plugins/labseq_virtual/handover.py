@@ -1,4 +1,4 @@
-"""The model of pick-up and drop-off of an atom, its constants, and tables of the tones of an axis.
+"""The model of pick-up and drop-off of an atom, and the records of it that the kernels take.
 
 The model uses only depths and positions of the tweezers and does not follow the atoms; its constants are
 those of ``settings.py``. Energies are in kelvin. The formulas are in ``tweezer_kernels.py``; the reasons:
@@ -28,35 +28,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import AxisTones, MotionSpec, SiteGrid
+from labseq.plugin import MotionSpec, SiteGrid
 from labseq_virtual.settings import SimulationSettings
 
 Floats = NDArray[np.float64]
 
 KELVIN: Final = 1.380649e-23 / (86.909180531 * 1.66053906660e-27)
 """m^2/s^2 per kelvin: energies per mass of 87Rb (AME2020, CODATA 2018)."""
-
-REFERENCE_TONES: Final = 19
-"""Further tones that the setting ``intermodulation`` belongs to: the paper measured it on 20 tweezers."""
-(
-    SPACING,
-    SKEW,
-    TOLERANCE,
-    STATIC_DEPTH,
-    STATIC_WAIST,
-    TEMPERATURE,
-    TRANSPORT_LOSS,
-    PER_TONE,
-    MOBILE_DEPTH,
-    DEPTH_DROP,
-    INTERMODULATION,
-    ADIABATIC_DEPTH,
-    SHALLOW_LOSS,
-    COOLING_HZ,
-    NOISE_HZ,
-    PAIR_SURVIVAL,
-) = range(16)
-"""Indices of the constants in the array that the kernels take."""
 
 
 @lru_cache(maxsize=8)
@@ -115,71 +93,6 @@ def pair_survival(settings: SimulationSettings) -> float:
     if settings.pair_survival is not None:
         return settings.pair_survival
     return max(0.0, 2.0 - 1.0 / max(settings.loading, 0.5))
-
-
-def constants(grid: SiteGrid, settings: SimulationSettings) -> Floats:
-    """The constants for the kernels, float64 (16,), in the order of the names above, in SI."""
-    a1, a2 = grid.axes
-    light = settings.mobile_light
-    named = {
-        SPACING: grid.spacing_m,
-        SKEW: 2 * float(a1 @ a2),
-        TOLERANCE: settings.site_tolerance,
-        STATIC_DEPTH: settings.static_depth,
-        STATIC_WAIST: settings.static_waist,
-        TEMPERATURE: settings.temperature,
-        TRANSPORT_LOSS: settings.transport_loss,
-        PER_TONE: settings.transport_loss_per_tone,
-        MOBILE_DEPTH: light.depth,
-        DEPTH_DROP: light.depth_drop_per_tone,
-        INTERMODULATION: light.intermodulation,
-        ADIABATIC_DEPTH: light.adiabatic_depth,
-        SHALLOW_LOSS: light.shallow_loss,
-        COOLING_HZ: 1 / settings.cooling_time,
-        NOISE_HZ: noise_hz(settings),
-        PAIR_SURVIVAL: pair_survival(settings),
-    }
-    return np.array([named[place] for place in range(len(named))])
-
-
-MIXING: Final = 0.45
-"""Distance of two tones, in sites, below which their tweezers merge (ours)."""
-AT_REST: Final = 1e-6
-"""Motion in a segment, in sites, below which a tweezer counts as at rest (rounding)."""
-
-START, END, POWER_START, POWER_END, ON_START, ON_END = range(6)
-"""Columns of a table of tones: positions at start and end in sites, powers relative to the intended ones,
-and whether the tone is on (1 or 0)."""
-DARK, NEW, EMPTY, HELD = range(4)
-"""States of a crossing of two tones: off, just switched on, on without an atom, on with an atom."""
-
-ATOM, TRAP_DEPTH, ATOM_HEAT, HEAT_AT_S, HAZARD = range(5)
-"""Columns of a table of sites: whether there is an atom (1 or 0); the depth of the static tweezer in kelvin;
-the temperature of the atom, as it would be at the nominal depth; the time that it belongs to; and the hazard
-of the atom by tweezers that passed it: it stays with the probability ``exp(-hazard)``."""
-N_SITE: Final = 5
-
-
-def tone_table(axis: AxisTones, start: Floats, end: Floats, full: Floats, on_amplitude: float) -> Floats:
-    """The tones of all segments, float64 (n_tones, 6), with the columns above.
-
-    Args:
-        axis: The axis of a program.
-        start: float64 (n_tones,), positions at the start of the tones' segments, in sites.
-        end: float64 (n_tones,), positions at the end.
-        full: float64 (n_sites,), amplitude that gives the full depth.
-        on_amplitude: Amplitude above which a tone is on.
-    """
-    sites = np.arange(len(full))
-    table = np.empty((len(start), 6))
-    table[:, START], table[:, END] = start, end
-    table[:, POWER_START] = (axis.start_amplitude / np.interp(start, sites, full)) ** 2
-    table[:, POWER_END] = (axis.end_amplitude / np.interp(end, sites, full)) ** 2
-    table[:, ON_START], table[:, ON_END] = (
-        axis.start_amplitude > on_amplitude,
-        axis.end_amplitude > on_amplitude,
-    )
-    return table
 
 
 def full_amplitudes(grid: SiteGrid, motion: MotionSpec) -> tuple[Floats, Floats]:

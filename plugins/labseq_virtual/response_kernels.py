@@ -2,10 +2,9 @@
 
 Arguments that occur in several kernels:
 
-- ``tables``: the tables of a move, one after the other, see :func:`labseq_virtual.responses.move_tables`.
 - ``static``, ``mobile``: depth of the static tweezer, and greatest depth of the mobile one, in kelvin.
 - ``heat``: temperature of the atom in a static tweezer of the nominal depth.
-- ``constants``: see :func:`labseq_virtual.handover.constants`.
+- ``constants``: the machine and the tables, see :class:`labseq_virtual.tweezer_kernels.Constants`.
 
 All return the loss, and the ratio of the temperatures after and before.
 """
@@ -13,12 +12,12 @@ All return the loss, and the ratio of the temperatures after and before.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import const, helper_kernel
-from labseq_virtual.handover import COOLING_HZ, NOISE_HZ, STATIC_DEPTH, STATIC_WAIST, TEMPERATURE
+from labseq.plugin import helper_kernel
 from labseq_virtual.responses import (
     AXES,
     DEPTH_K,
@@ -31,13 +30,13 @@ from labseq_virtual.responses import (
     WAIST_M,
 )
 
+if TYPE_CHECKING:
+    from labseq_virtual.tweezer_kernels import Constants
+
 Floats = NDArray[np.float64]
 
-VECTOR = const("float64", 1)
-RESPONSE = "UniTuple(float64, 2)"
-
-TRANSPORT, LANDING, PASSING, STARTING = range(2, 6)
-"""Places in ``MOVE_TABLES``; those of pick-up and drop-off are 0 and 1, that of stopping follows STARTING."""
+PICK_UP, DROP_OFF, TRANSPORT, LANDING, PASSING, STARTING, STOPPING = range(7)
+"""Places in ``MOVE_TABLES``."""
 RATIO_AXIS, TEMPERATURE_AXIS = np.array(RATIOS), np.array(TEMPERATURES)
 AXIS_LENGTH = np.array([[len(axis) for axis in AXES[name][:2]] for name in MOVE_TABLES])
 AXIS_VALUES = np.concatenate([np.array(axis, np.float64) for name in MOVE_TABLES for axis in AXES[name][:2]])
@@ -51,7 +50,7 @@ CURVED_SITES = 4.0
 """Length of the moves in the table of a curved course, in sites."""
 
 
-@helper_kernel(f"Tuple((int64, float64))({VECTOR}, float64)")
+@helper_kernel()
 def locate(axis: Floats, x: float) -> tuple[int, float]:
     """The interval of an axis that a value is in, and where in it; the nearest end if it is beyond."""
     if not x > axis[0]:
@@ -62,9 +61,9 @@ def locate(axis: Floats, x: float) -> tuple[int, float]:
     return len(axis) - 2, 1.0
 
 
-@helper_kernel(f"{RESPONSE}(int64, float64, float64, float64, float64, {VECTOR})")
+@helper_kernel()
 def respond(
-    table: int, first: float, second: float, ratio: float, temperature: float, tables: Floats
+    table: int, first: float, second: float, ratio: float, temperature: float, constants: Constants
 ) -> tuple[float, float]:
     """Interpolate a table linearly.
 
@@ -74,9 +73,9 @@ def respond(
         second: Value on its second one.
         ratio: Mobile over static depth.
         temperature: In the static tweezer of the tables.
-        tables: The tables.
+        constants: The constants.
     """
-    n_first, n_second = AXIS_LENGTH[table, 0], AXIS_LENGTH[table, 1]
+    n_first, n_second, tables = AXIS_LENGTH[table, 0], AXIS_LENGTH[table, 1], constants.tables
     firsts = AXIS_VALUES[AXIS_AT[table, 0] : AXIS_AT[table, 0] + n_first]
     seconds = AXIS_VALUES[AXIS_AT[table, 1] : AXIS_AT[table, 1] + n_second]
     i, part = locate(firsts, first)
@@ -96,117 +95,111 @@ def respond(
     return float(loss), float(warmer)
 
 
-@helper_kernel(f"float64(float64, {VECTOR})")
-def quicker(static: float, constants: Floats) -> float:
+@helper_kernel()
+def quicker(static: float, constants: Constants) -> float:
     """Trap frequency of a static tweezer relative to that of the tables."""
-    return math.sqrt(static / DEPTH_K) * WAIST_M / constants[STATIC_WAIST]
+    return math.sqrt(static / DEPTH_K) * WAIST_M / constants.static_waist
 
 
-@helper_kernel(f"float64(float64, float64, {VECTOR})")
-def speed_in_table(speed_m_s: float, static: float, constants: Floats) -> float:
+@helper_kernel()
+def speed_in_table(speed_m_s: float, static: float, constants: Constants) -> float:
     """The speed that does in the tables' tweezer what this one does in a static tweezer."""
-    return speed_m_s * WAIST_M / constants[STATIC_WAIST] / quicker(static, constants)
+    return speed_m_s * WAIST_M / constants.static_waist / quicker(static, constants)
 
 
-@helper_kernel(f"float64(float64, float64, {VECTOR})")
-def temperature_in_table(heat: float, static: float, constants: Floats) -> float:
+@helper_kernel()
+def temperature_in_table(heat: float, static: float, constants: Constants) -> float:
     """The temperature that an atom has in the tables' tweezer."""
-    return heat * math.sqrt(static / constants[STATIC_DEPTH]) * DEPTH_K / static
+    return heat * math.sqrt(static / constants.static_depth) * DEPTH_K / static
 
 
-@helper_kernel(f"{RESPONSE}(int64, float64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+@helper_kernel()
 def hand_over(
-    stage: int, static: float, mobile: float, away_m: float, ramp_s: float, heat: float,
-    constants: Floats, tables: Floats,
-) -> tuple[float, float]:  # fmt: skip
-    """Response to pick-up (stage 0) or drop-off (stage 1).
+    table: int, static: float, mobile: float, away_m: float, ramp_s: float, heat: float, constants: Constants
+) -> tuple[float, float]:
+    """Response to pick-up or drop-off.
 
     Args:
-        stage: Which.
+        table: ``PICK_UP`` or ``DROP_OFF``.
         static: Depth of the static tweezer.
         mobile: Greatest depth of the mobile one.
         away_m: Distance between both, in metres.
         ramp_s: Duration of the ramp.
         heat: Temperature of the atom.
         constants: The constants.
-        tables: The tables.
     """
     if not static > 0.0:
         return 1.0, 1.0
     temperature = temperature_in_table(heat, static, constants)
-    ramp, away = ramp_s * quicker(static, constants), away_m / constants[STATIC_WAIST]
-    return respond(stage, ramp, away, mobile / static, temperature, tables)
+    ramp, away = ramp_s * quicker(static, constants), away_m / constants.static_waist
+    return respond(table, ramp, away, mobile / static, temperature, constants)
 
 
-@helper_kernel(f"{RESPONSE}(int64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+@helper_kernel()
 def carry(
-    course: int, speed_m_s: float, length_m: float, mobile: float, heat: float, constants: Floats,
-    tables: Floats,
+    course: int, speed_m_s: float, length_m: float, mobile: float, heat: float, constants: Constants,
 ) -> tuple[float, float]:  # fmt: skip
     """Response to a move over empty sites; ``speed_m_s``: the mean one over ``length_m``."""
-    static = constants[STATIC_DEPTH]
+    static = constants.static_depth
     speed = speed_in_table(speed_m_s, static, constants)
     if course > 0:  # what counts is the acceleration
         speed *= math.sqrt(CURVED_SITES * SITE_M / max(length_m, 0.1 * SITE_M))
-    return respond(TRANSPORT, float(course), speed, mobile / static, heat * DEPTH_K / static, tables)
+    return respond(TRANSPORT, float(course), speed, mobile / static, heat * DEPTH_K / static, constants)
 
 
-@helper_kernel(f"{RESPONSE}(float64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+@helper_kernel()
 def land_on(
-    static: float, mobile: float, speed_m_s: float, ramp_s: float, heat: float, constants: Floats,
-    tables: Floats,
+    static: float, mobile: float, speed_m_s: float, ramp_s: float, heat: float, constants: Constants,
 ) -> tuple[float, float]:  # fmt: skip
     """Response of an atom on which an empty tweezer lands at a speed, and goes off in a ramp."""
     if not static > 0.0:
         return 1.0, 1.0
     temperature = temperature_in_table(heat, static, constants)
     speed, ramp = speed_in_table(speed_m_s, static, constants), ramp_s * quicker(static, constants)
-    return respond(LANDING, speed, ramp, mobile / static, temperature, tables)
+    return respond(LANDING, speed, ramp, mobile / static, temperature, constants)
 
 
-@helper_kernel(f"{RESPONSE}(float64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+@helper_kernel()
 def pass_by(
-    static: float, mobile: float, speed_m_s: float, away_m: float, heat: float, constants: Floats,
-    tables: Floats,
+    static: float, mobile: float, speed_m_s: float, away_m: float, heat: float, constants: Constants,
 ) -> tuple[float, float]:  # fmt: skip
     """Response of an atom that a tweezer passes; ``away_m``: its nearest distance."""
     if not static > 0.0:
         return 1.0, 1.0
     temperature = temperature_in_table(heat, static, constants)
-    speed, away = speed_in_table(speed_m_s, static, constants), away_m / constants[STATIC_WAIST]
-    log_loss, warmer = respond(PASSING, speed, away, mobile / static, temperature, tables)
+    speed, away = speed_in_table(speed_m_s, static, constants), away_m / constants.static_waist
+    log_loss, warmer = respond(PASSING, speed, away, mobile / static, temperature, constants)
     loss = math.exp(log_loss)
     return (loss if loss > 2 * LEAST_LOSS else 0.0), warmer
 
 
-@helper_kernel(f"{RESPONSE}(int64, float64, float64, float64, float64, {VECTOR}, {VECTOR})")
+@helper_kernel()
 def at_once(
-    stage: int, mobile: float, speed_m_s: float, ramp_s: float, heat: float, constants: Floats, tables: Floats
+    table: int, mobile: float, speed_m_s: float, ramp_s: float, heat: float, constants: Constants
 ) -> tuple[float, float]:
-    """Further response where a start follows a ramp at once (stage 0), or a ramp a stop (stage 1).
+    """Further response where a start follows a ramp at once, or a ramp a stop.
 
     Args:
-        stage: Which.
+        table: ``STARTING`` or ``STOPPING``.
         mobile: Greatest depth of the mobile tweezer.
         speed_m_s: Speed of the move, constant.
         ramp_s: Time from the beginning of the ramp to the start, or from the stop to the end of the ramp:
             compared with the transit time of the sound, which does not scale.
         heat: Temperature of the atom before the move.
         constants: The constants.
-        tables: The tables.
     """
     if not ramp_s < LONGEST_START_S:
         return 0.0, 1.0
-    static = constants[STATIC_DEPTH]
+    static = constants.static_depth
     speed = speed_in_table(speed_m_s, static, constants)
     temperature = heat * DEPTH_K / static
-    return respond(STARTING + stage, ramp_s, speed, mobile / static, temperature, tables)
+    return respond(table, ramp_s, speed, mobile / static, temperature, constants)
 
 
-@helper_kernel(f"float64(float64, float64, {VECTOR})")
-def relaxed(heat: float, elapsed_s: float, constants: Floats) -> float:
+@helper_kernel()
+def relaxed(heat: float, elapsed_s: float, constants: Constants) -> float:
     """Temperature after a time in a static tweezer: cooled, or heated by the noise of the intensity."""
-    if constants[COOLING_HZ] > 0.0:
-        aim = constants[TEMPERATURE]
-        return float(aim + (heat - aim) * math.exp(-elapsed_s * constants[COOLING_HZ]))
-    return float(heat * math.exp(min(elapsed_s * constants[NOISE_HZ], 20.0)))
+    if constants.cooling_hz > 0.0:
+        aim = constants.temperature
+        return float(aim + (heat - aim) * math.exp(-elapsed_s * constants.cooling_hz))
+    return float(heat * math.exp(min(elapsed_s * constants.noise_hz, 20.0)))

@@ -40,7 +40,8 @@ from labseq_virtual.sensors import View
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.static_array import StaticArray
 from labseq_virtual.tone_positions import TonePositions
-from labseq_virtual.transport import CAUSES, RunningProgram, Transport
+from labseq_virtual.transport import RunningProgram, Transport
+from labseq_virtual.tweezer_kernels import CAUSES
 from labseq_virtual.tweezer_view import TweezerView
 
 MIN_LEVEL: Final = 1e-3

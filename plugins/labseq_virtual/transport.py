@@ -28,41 +28,20 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import MotionSpec, SiteGrid, ToneProgram
-from labseq.plugin.motion import FrequencyCourse
 from labseq_virtual.atoms import Atoms
-from labseq_virtual.handover import (
-    ATOM,
-    ATOM_HEAT,
-    COOLING_HZ,
-    HAZARD,
-    HEAT_AT_S,
-    N_SITE,
-    PAIR_SURVIVAL,
-    TRAP_DEPTH,
-    constants,
-    full_amplitudes,
-    merging_distance,
-    pair_survival,
-    tone_table,
-)
-from labseq_virtual.responses import move_tables
+from labseq_virtual.handover import full_amplitudes, merging_distance, pair_survival
+from labseq_virtual.records import SITE, TONE
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.tone_positions import TonePositions
+from labseq_virtual.tweezer_kernels import CAUSES, LOSSES, N_DRAWS, constants
 
 Floats = NDArray[np.float64]
-
-CAUSES: Final[tuple[str, ...]] = ("hand_over", "transport", "collision", "ejected", "program")
-"""Causes of losses in transport. "program": the tweezer switched off or jumped."""
-HAND_OVER, TRANSPORT, COLLISION, EJECTED, PROGRAM = range(5)
-"""Indices of these causes in the array of the kernels."""
-FASTEST: Final = np.array([course.fastest for course in FrequencyCourse])
-"""Greatest speed relative to the mean speed, for each course."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,24 +115,33 @@ class Transport:
         rows, cols = self._tones(program, 0), self._tones(program, 1)
         offsets = program.row.offsets, program.column.offsets
         n_segments = min(n_segments, program.n_segments)
-        draws = rng.random((max_drop_offs(rows, offsets[0], cols, offsets[1], n_segments), 3))
-        self._constants[COOLING_HZ] = cooled / self._settings.cooling_time
-        self._constants[PAIR_SURVIVAL] = pair_survival(self._settings) if cooled > 0 else 0.0
-        sites = np.zeros((*depth.shape, N_SITE))
-        sites[..., ATOM], sites[..., TRAP_DEPTH] = atoms.occupied, depth * self._settings.static_depth
-        sites[..., ATOM_HEAT], sites[..., HEAT_AT_S] = atoms.heat, atoms.since_s
-        lost = carry_atoms(
+        draws = rng.random((max_drop_offs(rows, offsets[0], cols, offsets[1], n_segments), N_DRAWS))
+        tables, *numbers = self._constants._replace(
+            cooling_hz=cooled / self._settings.cooling_time,
+            pair_survival=pair_survival(self._settings) if cooled > 0 else 0.0,
+        )
+        sites, lost = np.zeros(depth.shape, SITE), np.zeros(1, LOSSES)
+        sites["atom"], sites["depth"] = atoms.occupied, depth * self._settings.static_depth
+        sites["heat"], sites["since_s"] = atoms.heat, atoms.since_s
+        carry_atoms(
             sites, start_s, rows, offsets[0], cols, offsets[1], program.duration_s, program.course,
-            n_segments, loss_factor, draws, self._constants, self._merging, move_tables(),
+            n_segments, loss_factor, draws, tables, tuple(numbers), self._merging, lost[0],
         )  # fmt: skip
-        atoms.occupied[...] = sites[..., ATOM] > 0
-        atoms.heat[...], atoms.since_s[...] = sites[..., ATOM_HEAT], sites[..., HEAT_AT_S]
-        if sites[..., HAZARD].any():
-            lost[COLLISION] += atoms.lose(rng.random(depth.shape) < -np.expm1(-sites[..., HAZARD]))
-        by_cause: Counter[str] = Counter(dict(zip(CAUSES, lost.tolist(), strict=True)))
-        return +by_cause
+        atoms.occupied[...] = sites["atom"]
+        atoms.heat[...], atoms.since_s[...] = sites["heat"], sites["since_s"]
+        if sites["hazard"].any():
+            taken = atoms.lose(rng.random(depth.shape) < -np.expm1(-sites["hazard"]))
+            lost["collision"] += taken
+        return +Counter({cause: int(lost[cause][0]) for cause in CAUSES})
 
-    def _tones(self, program: ToneProgram, index: int) -> Floats:
-        axis = (program.row, program.column)[index]
+    def _tones(self, program: ToneProgram, index: int) -> NDArray[Any]:
+        """The tones of all segments of an axis, (n_tones,); see :class:`labseq_virtual.records.Tone`."""
+        axis, full = (program.row, program.column)[index], self._full[index]
+        sites, least = np.arange(len(full)), self._settings.on_amplitude
         start, end = self._positions.actual(index, axis.start_hz), self._positions.actual(index, axis.end_hz)
-        return tone_table(axis, start, end, self._full[index], self._settings.on_amplitude)
+        tones = np.empty(len(start), TONE)
+        tones["start"], tones["end"] = start, end
+        tones["power_start"] = (axis.start_amplitude / np.interp(start, sites, full)) ** 2
+        tones["power_end"] = (axis.end_amplitude / np.interp(end, sites, full)) ** 2
+        tones["on_start"], tones["on_end"] = axis.start_amplitude > least, axis.end_amplitude > least
+        return tones

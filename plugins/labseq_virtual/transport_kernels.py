@@ -1,132 +1,126 @@
 """Kernels of the rules in ``transport.py``: all tweezers of a program, and the atoms on the sites.
 
-Arguments that occur in several kernels:
+Arguments that occur in several kernels; the records are those of ``records.py`` and ``tweezer_kernels.py``:
 
-- ``sites``: the sites and their atoms (n_rows, n_cols, N_SITE), with the columns of ``handover.py``.
-- ``row``, ``col``: the tones of a segment, with the columns of ``handover.py`` (n_tones, N_COLUMNS).
-- ``tweezers``: the crossings of these tones (at least n_row_tones, n_col_tones, N_TWEEZER), with the columns
-  of ``tweezer_kernels.py``.
-- ``constants``, ``tables``: as in ``tweezer_kernels.py``.
+- ``sites``: the sites and their atoms, ``Site`` (n_rows, n_cols).
+- ``row``, ``col``: the tones of a segment, ``Tone`` (n_tones,).
+- ``tweezers``: the crossings of these tones, ``Tweezer`` (n_row_tones, n_col_tones).
+- ``lost``: the ``Losses`` so far; changed in place.
+- ``constants``: the machine, ``Constants``.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import const, helper_kernel, kernel
-from labseq_virtual.handover import (
-    AT_REST,
-    ATOM,
-    ATOM_HEAT,
-    DARK,
-    EMPTY,
-    END,
-    HAZARD,
-    HEAT_AT_S,
-    HELD,
-    MIXING,
-    NEW,
-    ON_END,
-    ON_START,
-    PAIR_SURVIVAL,
-    POWER_END,
-    POWER_START,
-    SKEW,
-    SPACING,
-    START,
-    STATIC_DEPTH,
-    STATIC_WAIST,
-    TOLERANCE,
-    TRAP_DEPTH,
-)
+from labseq_virtual.records import SITE, TONE, Site, signature
 from labseq_virtual.response_kernels import land_on, pass_by, relaxed
 from labseq_virtual.responses import BESIDE
-from labseq_virtual.transport import COLLISION, EJECTED, HAND_OVER, PROGRAM, TRANSPORT
 from labseq_virtual.tweezer_kernels import (
-    AWAY,
-    DEPTH,
-    DOWN,
-    FALL_S,
-    HEAT,
+    DARK,
+    EMPTY,
+    HELD,
     INSTANT_S,
-    IS_PICKED,
-    LOST,
-    N_TWEEZER,
-    PEAK,
+    LOSSES,
+    N_NUMBERS,
+    NEW,
     RAMP,
-    RIGHT,
-    SITE_DEPTH,
-    SPEED,
-    STATE,
+    TWEEZER,
+    Constants,
+    Losses,
+    Tweezer,
     advance,
+    affect,
     mobile_depth,
     risks,
+    survives,
     takes,
+    way_of,
 )
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Offsets = NDArray[np.int32]
+Records = Any
+"""An array of records: numpy has no type for one that knows its columns."""
 
 TABLE, VECTOR, OFFSETS = const("float64", 2), const("float64", 1), const("int32", 1)
-SITES = TWEEZERS = "float64[:, :, ::1]"
-NUMBERS = "int64[::1]"
+TONES = const(signature(TONE), 1)
+
+MIXING = 0.45
+"""Distance of two tones, in sites, below which their tweezers merge (ours)."""
+AT_REST = 1e-6
+"""Motion in a segment, in sites, below which a tweezer counts as at rest (rounding)."""
 
 
-@helper_kernel(f"int64({TABLE}, int64, int64)")
-def count_on(tones: Floats, one: int, other: int) -> int:
-    """Number of tones that are on in both of two columns (start and end, or the same column twice)."""
-    n = 0
-    for tone in range(len(tones)):
-        n += tones[tone, one] * tones[tone, other] > 0.0
-    return n
+class Lit(NamedTuple):
+    """How many tones of an axis are on in a segment: at its start, at its end, at both, at any of them."""
+
+    start: int
+    end: int
+    both: int
+    any: int
 
 
-@helper_kernel(f"int64({TABLE})")
-def count_lit(tones: Floats) -> int:
-    """Number of tones that are on at the start or at the end."""
-    n = 0
-    for tone in range(len(tones)):
-        n += tones[tone, ON_START] + tones[tone, ON_END] > 0.0
-    return n
+@helper_kernel()
+def count_lit(tones: Records) -> Lit:
+    """How many tones are on."""
+    start, end, both = 0, 0, 0
+    for tone in tones:
+        start += tone.on_start
+        end += tone.on_end
+        both += tone.on_start and tone.on_end
+    return Lit(start, end, both, start + end - both)
 
 
-@helper_kernel(f"boolean({TABLE}, {TABLE})")
-def any_lit(row: Floats, col: Floats) -> bool:
-    """Whether any crossing is on at the start or at the end."""
-    at_start = count_on(row, ON_START, ON_START) * count_on(col, ON_START, ON_START)
-    return at_start + count_on(row, ON_END, ON_END) * count_on(col, ON_END, ON_END) > 0
-
-
-@kernel(f"int64({TABLE}, {OFFSETS}, {TABLE}, {OFFSETS}, int64)")
+@kernel(f"int64({TONES}, {OFFSETS}, {TONES}, {OFFSETS}, int64)")
 def max_drop_offs(
-    rows: Floats, row_offsets: Offsets, cols: Floats, col_offsets: Offsets, n_segments: int
+    rows: Records, row_offsets: Offsets, cols: Records, col_offsets: Offsets, n_segments: int
 ) -> int:
     """Number of crossings that switch off within the first segments: an upper limit on the drop-offs."""
     n = 0
     for k in range(n_segments):
-        row, col = rows[row_offsets[k] : row_offsets[k + 1]], cols[col_offsets[k] : col_offsets[k + 1]]
-        n += count_on(row, ON_START, ON_START) * count_on(col, ON_START, ON_START)
-        n -= count_on(row, ON_START, ON_END) * count_on(col, ON_START, ON_END)
+        row = count_lit(rows[row_offsets[k] : row_offsets[k + 1]])
+        col = count_lit(cols[col_offsets[k] : col_offsets[k + 1]])
+        n += row.start * col.start - row.both * col.both
     return n
 
 
-@helper_kernel(f"int64({TWEEZERS}, {TABLE}, {TABLE})")
-def count_held(tweezers: Floats, row: Floats, col: Floats) -> int:
+class Segment(NamedTuple):
+    """A segment of a program.
+
+    Attributes:
+        start_s: When it starts.
+        duration_s: Its duration.
+        course: Course of its frequencies.
+        n_further: Tones that are on beyond one per axis.
+        factor: The shot's factor on the losses.
+    """
+
+    start_s: float
+    duration_s: float
+    course: int
+    n_further: int
+    factor: float
+
+
+@helper_kernel()
+def count_held(tweezers: Records) -> int:
     """Number of tweezers that hold an atom."""
     n = 0
-    for i in range(len(row)):
-        for j in range(len(col)):
-            n += tweezers[i, j, STATE] == HELD
+    for tweezer in tweezers.ravel():
+        n += tweezer.state == HELD
     return n
 
 
-@helper_kernel(f"{NUMBERS}({TABLE}, {TABLE}, float64)")
-def match(before: Floats, now: Floats, tolerance: float) -> Ints:
+@helper_kernel()
+def match(before: Records, now: Records, tolerance: float) -> Ints:
     """For each tone the nearest one of the segment before (n_tones,); -1 where none is close enough.
 
     A tone that is the nearest one to several continues as the closest of these, or the first of them.
@@ -135,7 +129,7 @@ def match(before: Floats, now: Floats, tolerance: float) -> Ints:
     for tone in range(len(now)):
         least = math.inf
         for other in range(len(before)):
-            away = abs(now[tone, START] - before[other, END])
+            away = abs(now[tone].start - before[other].end)
             if away < least:
                 least = away
                 nearest[tone] = other if away <= tolerance else -1
@@ -146,155 +140,133 @@ def match(before: Floats, now: Floats, tolerance: float) -> Ints:
     return nearest
 
 
-@helper_kernel(f"void({TABLE}, {TABLE}, {TWEEZERS}, {TABLE}, {TABLE}, {TWEEZERS}, float64)")
+@helper_kernel()
 def follow(
-    old_row: Floats,
-    old_col: Floats,
-    old: Floats,
-    row: Floats,
-    col: Floats,
-    tweezers: Floats,
-    tolerance: float,
-) -> None:
+    old_row: Records, old_col: Records, old: Records, row: Records, col: Records, tolerance: float
+) -> Records:
     """Rule 1: tweezers that stay on keep their atoms; other crossings are new or dark."""
     from_row, from_col = match(old_row, row, tolerance), match(old_col, col, tolerance)
+    tweezers = np.zeros((len(row), len(col)), TWEEZER)
     for i in range(len(row)):
         for j in range(len(col)):
-            on = row[i, ON_START] * col[j, ON_START] > 0.0
-            m, n = from_row[i], from_col[j]
-            if on and m >= 0 and n >= 0 and old[m, n, STATE] != DARK:
+            tweezer, m, n = tweezers[i, j], from_row[i], from_col[j]
+            on_start = row[i].on_start and col[j].on_start
+            on_end = row[i].on_end and col[j].on_end
+            if on_start and m >= 0 and n >= 0 and old[m, n].state != DARK:
                 tweezers[i, j] = old[m, n]
-            else:
-                lit = on or row[i, ON_END] * col[j, ON_END] > 0.0
-                tweezers[i, j] = 0.0
-                tweezers[i, j, STATE] = NEW if lit else DARK
+            elif on_start or on_end:
+                tweezer.state = NEW
+            tweezer.row, tweezer.col = row[i].start, col[j].start
+            tweezer.to_row, tweezer.to_col = row[i].end, col[j].end
+            tweezer.power_start = row[i].power_start * col[j].power_start
+            tweezer.power_end = row[i].power_end * col[j].power_end
+            tweezer.stays_on = on_end
+    return tweezers
 
 
-@helper_kernel(f"Tuple((int64, int64, float64, boolean))(float64, float64, {SITES}, {VECTOR})")
-def nearest_site(row: float, col: float, sites: Floats, constants: Floats) -> tuple[int, int, float, bool]:
+@helper_kernel()
+def nearest_site(
+    row: float, col: float, sites: Records, constants: Constants
+) -> tuple[int, int, float, bool]:
     """The site nearest to a position, its distance in metres, and whether the position is in the grid."""
     r, c = round(row), round(col)
     down, right = row - r, col - c
-    away_m = math.sqrt(
-        (down * down + right * right) * (constants[SPACING] * constants[SPACING])
-        + down * right * constants[SKEW]
-    )
+    spacing2 = constants.spacing * constants.spacing
+    away_m = math.sqrt((down * down + right * right) * spacing2 + down * right * constants.skew)
     inside = 0 <= r < sites.shape[0] and 0 <= c < sites.shape[1]
     r, c = min(max(r, 0), sites.shape[0] - 1), min(max(c, 0), sites.shape[1] - 1)
     return r, c, away_m, inside
 
 
-@helper_kernel(f"float64(float64[::1], float64, {VECTOR})")
-def heat_of(site: Floats, now_s: float, constants: Floats) -> float:
+@helper_kernel()
+def heat_of(site: Site, now_s: float, constants: Constants) -> float:
     """Temperature of the atom on a site now."""
-    return relaxed(site[ATOM_HEAT], now_s - site[HEAT_AT_S], constants)
+    return relaxed(site.heat, now_s - site.since_s, constants)
 
 
-@helper_kernel("void(float64[::1], float64, float64, float64)")
-def disturb(site: Floats, loss: float, heat: float, now_s: float) -> None:
+@helper_kernel()
+def disturb(site: Site, loss: float, heat: float, now_s: float) -> None:
     """Set the temperature of the atom on a site, and add to its hazard of being lost."""
-    site[ATOM_HEAT], site[HEAT_AT_S] = heat, now_s
-    site[HAZARD] -= math.log1p(-min(loss, 1.0 - 1e-9))
+    site.heat, site.since_s = heat, now_s
+    site.hazard -= math.log1p(-min(loss, 1.0 - 1e-9))
 
 
-@helper_kernel(f"void({SITES}, float64, {TABLE}, {TABLE}, {TWEEZERS}, {VECTOR}, {TABLE})")
+@helper_kernel()
 def pick_up(
-    sites: Floats,
-    now_s: float,
-    row: Floats,
-    col: Floats,
-    tweezers: Floats,
-    constants: Floats,
-    merging: Floats,
+    sites: Records, tweezers: Records, segment: Segment, constants: Constants, merging: Floats
 ) -> None:
     """Rule 2: tweezers that are ramped up take the atoms of the sites close to them, row by row."""
-    for i in range(len(row)):
-        for j in range(len(col)):
-            tweezer = tweezers[i, j]
-            if tweezer[STATE] != NEW:
-                continue
-            rises = row[i, POWER_START] * col[j, POWER_START] < RAMP * row[i, POWER_END] * col[j, POWER_END]
-            tweezer[STATE] = NEW if rises else EMPTY  # it may become deep enough in the next segment
-            r, c, away_m, inside = nearest_site(row[i, START], col[j, START], sites, constants)
-            site = sites[r, c]
-            if not (inside and site[ATOM] and takes(tweezer[DEPTH], site[TRAP_DEPTH], away_m, merging)):
-                continue
-            tweezer[STATE], site[ATOM] = HELD, 0.0
-            tweezer[SITE_DEPTH], tweezer[AWAY] = site[TRAP_DEPTH], away_m
-            tweezer[HEAT] = heat_of(site, now_s, constants)
-            tweezer[IS_PICKED] = 0.0
-            tweezer[LOST], site[HAZARD] = -math.expm1(-site[HAZARD]), 0.0
+    for tweezer in tweezers.ravel():
+        if tweezer.state != NEW:
+            continue
+        rises = tweezer.power_start < RAMP * tweezer.power_end
+        tweezer.state = NEW if rises else EMPTY  # it may become deep enough in the next segment
+        r, c, away_m, inside = nearest_site(tweezer.row, tweezer.col, sites, constants)
+        site = sites[r, c]
+        if not (inside and site.atom and takes(tweezer.depth, site.depth, away_m, merging)):
+            continue
+        tweezer.state, site.atom = HELD, False
+        tweezer.site_depth, tweezer.away = site.depth, away_m
+        tweezer.heat = heat_of(site, segment.start_s, constants)
+        tweezer.is_picked = False
+        tweezer.lost, site.hazard = -math.expm1(-site.hazard), 0.0
 
 
-@helper_kernel(f"boolean[::1]({TABLE})")
-def find_mixed(tones: Floats) -> Mask:
+@helper_kernel()
+def find_mixed(tones: Records) -> Mask:
     """Which tones come too close to another, or pass it (n_tones,)."""
     mixed = np.zeros(len(tones), np.bool_)
     for k in range(len(tones)):
         for m in range(k):
-            before, after = tones[k, START] - tones[m, START], tones[k, END] - tones[m, END]
+            tone, other = tones[k], tones[m]
+            before, after = tone.start - other.start, tone.end - other.end
             near = abs(before) < MIXING or abs(after) < MIXING or before * after < 0.0
-            one_on = tones[k, ON_START] + tones[k, ON_END] > 0.0
-            if near and one_on and tones[m, ON_START] + tones[m, ON_END] > 0.0:
+            if near and (tone.on_start or tone.on_end) and (other.on_start or other.on_end):
                 mixed[k] = mixed[m] = True
     return mixed
 
 
-@helper_kernel(f"int64({TABLE}, {TABLE}, {TWEEZERS})")
-def mix(row: Floats, col: Floats, tweezers: Floats) -> int:
-    """Rule 3: atoms on tones that mix are lost; returns their number."""
-    n_lost = 0
+@helper_kernel()
+def mix(row: Records, col: Records, tweezers: Records, lost: Losses) -> None:
+    """Rule 3: atoms on tones that mix are lost."""
     by_row, by_col = find_mixed(row), find_mixed(col)
     for i in range(len(row)):
         for j in range(len(col)):
-            if tweezers[i, j, STATE] == HELD and (by_row[i] or by_col[j]):
-                tweezers[i, j, STATE] = EMPTY
-                n_lost += 1
-    return n_lost
+            tweezer = tweezers[i, j]
+            if tweezer.state == HELD and (by_row[i] or by_col[j]):
+                tweezer.state = EMPTY
+                lost.collision += 1
 
 
-@helper_kernel(f"Tuple((float64[:, ::1], int64[:, ::1]))({TABLE}, {TABLE}, {TWEEZERS}, float64)")
-def find_paths(row: Floats, col: Floats, tweezers: Floats, min_depth: float) -> tuple[Floats, Ints]:
-    """Find the moving tweezers deep enough to knock atoms out.
-
-    Returns:
-        For each its row and column at the start, and its displacement along both (n, 4); and the numbers of
-        its tones (n, 2).
-    """
-    paths, crossing = np.empty((len(row) * len(col), 4)), np.empty((len(row) * len(col), 2), np.int64)
-    n = 0
-    for i in range(len(row)):
-        down = row[i, END] - row[i, START]
-        for j in range(len(col)):
-            right = col[j, END] - col[j, START]
-            still = abs(down) <= AT_REST and abs(right) <= AT_REST
-            if still or tweezers[i, j, STATE] == DARK or tweezers[i, j, DEPTH] <= min_depth:
-                continue
-            paths[n, 0], paths[n, 1], paths[n, 2], paths[n, 3] = row[i, START], col[j, START], down, right
-            crossing[n, 0], crossing[n, 1] = i, j
+@helper_kernel()
+def find_movers(tweezers: Records, min_depth: float) -> Ints:
+    """The numbers of the moving tweezers deep enough to knock atoms out (n,)."""
+    movers, n = np.empty(len(tweezers), np.int64), 0
+    for k in range(len(tweezers)):
+        tweezer = tweezers[k]
+        moves = max(abs(tweezer.to_row - tweezer.row), abs(tweezer.to_col - tweezer.col)) > AT_REST
+        if moves and tweezer.state != DARK and tweezer.depth > min_depth:
+            movers[n] = k
             n += 1
-    return paths[:n], crossing[:n]
+    return movers[:n]
 
 
-@helper_kernel(f"UniTuple(int64, 2)({TABLE}, int64, int64, float64)")
-def span(paths: Floats, axis: int, n_sites: int, tolerance: float) -> tuple[int, int]:
-    """Range of the rows (axis 0) or columns (axis 1) that paths come close to: first, last + 1."""
-    if len(paths) == 0:
-        return 0, 0
-    low, high = math.inf, -math.inf
-    for k in range(len(paths)):
-        start, end = paths[k, axis], paths[k, axis] + paths[k, 2 + axis]
-        low, high = min(low, start, end), max(high, start, end)
+@helper_kernel()
+def span(starts: Floats, ends: Floats, n_sites: int, tolerance: float) -> tuple[int, int]:
+    """Range of the rows or columns that tweezers come close to on their ways: first, last + 1."""
+    low, high = min(starts.min(), ends.min()), max(starts.max(), ends.max())
     first, last = math.floor(low - tolerance), math.ceil(high + tolerance)
     return max(first, 0), min(last + 1, n_sites)
 
 
-@helper_kernel(f"int64({TABLE}, int64, int64, float64)")
-def first_to_hit(paths: Floats, r: int, c: int, tolerance: float) -> int:
-    """Which path passes over a site first; -1 if none does. One that ends there lands or goes on."""
+@helper_kernel()
+def first_to_hit(tweezers: Records, movers: Ints, r: int, c: int, tolerance: float) -> int:
+    """Which tweezer passes over a site first; -1 if none does. One that ends there lands or goes on."""
     first, soonest = -1, math.inf
-    for k in range(len(paths)):
-        to_r, to_c, down, right = r - paths[k, 0], c - paths[k, 1], paths[k, 2], paths[k, 3]
+    for k in movers:
+        tweezer = tweezers[k]
+        down, right = way_of(tweezer)
+        to_r, to_c = r - tweezer.row, c - tweezer.col
         when = min(max((to_r * down + to_c * right) / (down * down + right * right), 0.0), 1.0)
         miss_r, miss_c = to_r - when * down, to_c - when * right
         ends_there = (to_r - down) ** 2 + (to_c - right) ** 2 <= tolerance * tolerance
@@ -303,55 +275,47 @@ def first_to_hit(paths: Floats, r: int, c: int, tolerance: float) -> int:
     return first
 
 
-@helper_kernel(f"int64({SITES}, {TABLE}, {TABLE}, {TWEEZERS}, {VECTOR})")
-def sweep(sites: Floats, row: Floats, col: Floats, tweezers: Floats, constants: Floats) -> int:
-    """Rule 4: moving tweezers knock out atoms on sites; returns the number of atoms lost.
+@helper_kernel()
+def sweep(sites: Records, tweezers: Records, constants: Constants, lost: Losses) -> None:
+    """Rule 4: moving tweezers knock out atoms on sites.
 
     The motion is a straight line from the start to the end of a segment. The first tweezer to arrive
     may lose its own atom too.
     """
-    tolerance, n_lost = constants[TOLERANCE], 0
-    paths, crossing = find_paths(row, col, tweezers, constants[STATIC_DEPTH])
-    top, bottom = span(paths, 0, sites.shape[0], tolerance)
-    left, right = span(paths, 1, sites.shape[1], tolerance)
+    tolerance = constants.site_tolerance
+    movers = find_movers(tweezers, constants.static_depth)
+    if len(movers) == 0:
+        return
+    on_way = tweezers[movers]
+    top, bottom = span(on_way.row, on_way.to_row, sites.shape[0], tolerance)
+    left, right = span(on_way.col, on_way.to_col, sites.shape[1], tolerance)
     for r in range(top, bottom):
         for c in range(left, right):
-            first = first_to_hit(paths, r, c, tolerance) if sites[r, c, ATOM] else -1
+            first = first_to_hit(tweezers, movers, r, c, tolerance) if sites[r, c].atom else -1
             if first < 0:
                 continue
-            sites[r, c, ATOM] = 0.0
-            n_lost += 1
-            tweezer = tweezers[crossing[first, 0], crossing[first, 1]]
-            if tweezer[STATE] == HELD and constants[PAIR_SURVIVAL] > 0.0:
-                tweezer[LOST] = 1.0 - (1.0 - tweezer[LOST]) * constants[PAIR_SURVIVAL]
-            elif tweezer[STATE] == HELD:
-                tweezer[STATE] = EMPTY
-                n_lost += 1
-    return n_lost
+            sites[r, c].atom = False
+            lost.collision += 1
+            tweezer = tweezers[first]
+            if tweezer.state == HELD and constants.pair_survival > 0.0:
+                affect(tweezer, (1.0 - constants.pair_survival, 1.0))
+            elif tweezer.state == HELD:
+                tweezer.state = EMPTY
+                lost.collision += 1
 
 
-@helper_kernel(f"float64(float64, float64, float64, float64, {VECTOR})")
-def dot(down: float, right: float, to_down: float, to_right: float, constants: Floats) -> float:
+@helper_kernel()
+def dot(down: float, right: float, to_down: float, to_right: float, constants: Constants) -> float:
     """Scalar product of two displacements in sites, along columns and rows, in square metres."""
-    straight = (down * to_down + right * to_right) * constants[SPACING] * constants[SPACING]
-    return straight + 0.5 * constants[SKEW] * (down * to_right + right * to_down)
+    straight = (down * to_down + right * to_right) * constants.spacing * constants.spacing
+    return straight + 0.5 * constants.skew * (down * to_right + right * to_down)
 
 
-@helper_kernel(f"float64(float64, float64, float64, float64, float64[::1], {VECTOR})")
-def nearest_pass(
-    to_down: float, to_right: float, down: float, right: float, tweezer: Floats, constants: Floats
-) -> float:
-    """Distance in metres at which a tweezer passes an atom in a segment; inf if it is nearest in another one.
-
-    Args:
-        to_down: From the tweezer at the start to the atom, in sites along the columns.
-        to_right: Along a row.
-        down: Displacement of the tweezer in the segment.
-        right: Along a row.
-        tweezer: The tweezer, with its velocity before.
-        constants: The constants.
-    """
-    was_down, was_right = tweezer[DOWN], tweezer[RIGHT]
+@helper_kernel()
+def nearest_pass(r: int, c: int, tweezer: Tweezer, constants: Constants) -> float:
+    """Distance in metres at which a tweezer passes a site in a segment; inf if it is nearest in another."""
+    down, right = way_of(tweezer)
+    to_down, to_right = r - tweezer.row, c - tweezer.col
     length2 = dot(down, right, down, right, constants)
     ahead = dot(to_down, to_right, down, right, constants)
     if length2 > 0.0 and ahead >= length2:
@@ -360,79 +324,60 @@ def nearest_pass(
         part = ahead / length2
         to_down, to_right = to_down - part * down, to_right - part * right
     else:
-        rested = was_down == 0.0 and was_right == 0.0
-        came_nearer = dot(to_down, to_right, was_down, was_right, constants) > 0.0
+        rested = tweezer.down_hz == 0.0 and tweezer.right_hz == 0.0
+        came_nearer = dot(to_down, to_right, tweezer.down_hz, tweezer.right_hz, constants) > 0.0
         if not (came_nearer or (rested and length2 > 0.0)):
             return math.inf
     return math.sqrt(dot(to_down, to_right, to_down, to_right, constants))
 
 
-@helper_kernel("UniTuple(int64, 2)(float64, float64, float64, int64)")
+@helper_kernel()
 def lines_beside(start: float, way: float, reach: float, n_lines: int) -> tuple[int, int]:
     """Range of the rows or columns within reach of a way: first, last + 1."""
     first = max(math.ceil(start + min(way, 0.0) - reach), 0)
     return first, min(math.floor(start + max(way, 0.0) + reach) + 1, n_lines)
 
 
-@helper_kernel(f"void({SITES}, float64, {TABLE}, {TABLE}, {TWEEZERS}, float64, {VECTOR}, {VECTOR})")
-def pass_atoms(
-    sites: Floats, now_s: float, row: Floats, col: Floats, tweezers: Floats, duration_s: float,
-    constants: Floats, tables: Floats,
-) -> None:  # fmt: skip
+@helper_kernel()
+def pass_atoms(sites: Records, tweezers: Records, segment: Segment, constants: Constants) -> None:
     """Rule 5: tweezers that pass atoms on sites add to their hazards of being lost, and of their own atom."""
-    cosine = 0.5 * constants[SKEW] / (constants[SPACING] * constants[SPACING])
-    within_m = BESIDE[-1] * constants[STATIC_WAIST]
-    reach = within_m / constants[SPACING] / math.sqrt(1.0 - cosine * cosine)
-    for i in range(len(row)):
-        for j in range(len(col)):
-            tweezer = tweezers[i, j]
-            if tweezer[STATE] == DARK:
-                continue
-            down, right = row[i, END] - row[i, START], col[j, END] - col[j, START]
-            speed_m_s = math.sqrt(dot(down, right, down, right, constants)) / max(duration_s, INSTANT_S)
-            top, bottom = lines_beside(row[i, START], down, reach, sites.shape[0])
-            left, last = lines_beside(col[j, START], right, reach, sites.shape[1])
-            for r in range(top, bottom):
-                for c in range(left, last):
-                    site = sites[r, c]
-                    if not site[ATOM]:
-                        continue
-                    to_down, to_right = r - row[i, START], c - col[j, START]
-                    away_m = nearest_pass(to_down, to_right, down, right, tweezer, constants)
-                    if not constants[TOLERANCE] * constants[SPACING] < away_m < within_m:
-                        continue
-                    heat, mobile = heat_of(site, now_s, constants), tweezer[DEPTH]
-                    loss, warmer = pass_by(
-                        site[TRAP_DEPTH], mobile, speed_m_s, away_m, heat, constants, tables
-                    )
-                    disturb(site, loss, heat * warmer, now_s)
-                    if tweezer[STATE] == HELD:
-                        tweezer[LOST] = 1.0 - (1.0 - tweezer[LOST]) * (1.0 - loss)
+    cosine = 0.5 * constants.skew / (constants.spacing * constants.spacing)
+    within_m = BESIDE[-1] * constants.static_waist
+    reach = within_m / constants.spacing / math.sqrt(1.0 - cosine * cosine)
+    for tweezer in tweezers:
+        if tweezer.state == DARK:
+            continue
+        down, right = way_of(tweezer)
+        speed_m_s = math.sqrt(dot(down, right, down, right, constants)) / max(segment.duration_s, INSTANT_S)
+        top, bottom = lines_beside(tweezer.row, down, reach, sites.shape[0])
+        left, last = lines_beside(tweezer.col, right, reach, sites.shape[1])
+        for r in range(top, bottom):
+            for c in range(left, last):
+                away_m = nearest_pass(r, c, tweezer, constants) if sites[r, c].atom else math.inf
+                if constants.site_tolerance * constants.spacing < away_m < within_m:
+                    pass_atom(sites[r, c], tweezer, away_m, speed_m_s, segment.start_s, constants)
 
 
-@helper_kernel(f"void({TABLE}, {TABLE}, {TWEEZERS}, float64, int64, int64, {VECTOR}, {VECTOR})")
-def advance_all(
-    row: Floats, col: Floats, tweezers: Floats, duration_s: float, kind: int, n_further: int,
-    constants: Floats, tables: Floats,
-) -> None:  # fmt: skip
-    """Continue the courses of all tweezers that are on over a segment."""
-    for i in range(len(row)):
-        for j in range(len(col)):
-            if tweezers[i, j, STATE] == DARK:
-                continue
-            start, end = row[i, POWER_START] * col[j, POWER_START], row[i, POWER_END] * col[j, POWER_END]
-            down, right = row[i, END] - row[i, START], col[j, END] - col[j, START]
-            advance(tweezers[i, j], start, end, down, right, duration_s, kind, n_further, constants, tables)
+@helper_kernel()
+def pass_atom(
+    site: Site, tweezer: Tweezer, away_m: float, speed_m_s: float, now_s: float, constants: Constants
+) -> None:
+    """A tweezer passes the atom on a site, at a distance; the atom that it carries is at risk as well."""
+    heat = heat_of(site, now_s, constants)
+    loss, warmer = pass_by(site.depth, tweezer.depth, speed_m_s, away_m, heat, constants)
+    disturb(site, loss, heat * warmer, now_s)
+    if tweezer.state == HELD:
+        affect(tweezer, (loss, 1.0))
 
 
-@helper_kernel("float64(int64, float64)")
+@helper_kernel()
 def one_left(n: int, pair_survival: float) -> float:
     """Probability that n atoms in a tweezer end as one, not none: P(n) of ``handover.pair_survival``."""
     return (1.0 - (pair_survival - 1.0) ** n) / (2.0 - pair_survival)
 
 
-@helper_kernel(f"int64({SITES}, int64[::1], {VECTOR}, int64, float64)")
-def land(sites: Floats, goals: Ints, luck: Floats, n: int, pair_survival: float) -> int:
+@helper_kernel()
+def land(sites: Records, goals: Ints, luck: Floats, n: int, pair_survival: float) -> int:
     """Put n atoms on their sites, all at once; returns how many of those that share a site are lost.
 
     Args:
@@ -452,147 +397,114 @@ def land(sites: Floats, goals: Ints, luck: Floats, n: int, pair_survival: float)
                 goals[other] = -1
                 n_here += 1
         site = sites[goal // sites.shape[1], goal % sites.shape[1]]
-        n_here += int(site[ATOM])
-        site[ATOM] = luck[k] < one_left(n_here, pair_survival)
-        n_lost += n_here - int(site[ATOM])
+        n_here += int(site.atom)
+        site.atom = luck[k] < one_left(n_here, pair_survival)
+        n_lost += n_here - int(site.atom)
     return n_lost
 
 
-@helper_kernel(f"void(float64[::1], float64, float64[::1], {VECTOR}, {VECTOR})")
-def land_empty(site: Floats, now_s: float, tweezer: Floats, constants: Floats, tables: Floats) -> None:
+@helper_kernel()
+def land_empty(site: Site, tweezer: Tweezer, now_s: float, constants: Constants) -> None:
     """An empty tweezer that came from elsewhere goes off on an atom, which may be lost, or is heated."""
-    speed_m_s, fall_s = tweezer[SPEED], tweezer[FALL_S]
-    if speed_m_s == 0.0:
+    if tweezer.speed == 0.0:
         return
     heat = heat_of(site, now_s, constants)
-    loss, warmer = land_on(site[TRAP_DEPTH], tweezer[PEAK], speed_m_s, fall_s, heat, constants, tables)
+    loss, warmer = land_on(site.depth, tweezer.peak, tweezer.speed, tweezer.fall_s, heat, constants)
     disturb(site, loss, heat * warmer, now_s)
 
 
-@helper_kernel(
-    f"int64({SITES}, float64, {TABLE}, {TABLE}, {TWEEZERS}, int64, float64, {TABLE}, {VECTOR}, {VECTOR}, "
-    f"{NUMBERS})"
-)
+@helper_kernel()
 def set_down(
-    sites: Floats, now_s: float, row: Floats, col: Floats, tweezers: Floats, n_further: int, factor: float,
-    draws: Floats, constants: Floats, tables: Floats, lost: Ints,
-) -> int:  # fmt: skip
+    sites: Records, tweezers: Records, segment: Segment, draws: Floats, constants: Constants, lost: Losses
+) -> int:
     """Rule 6: tweezers that switch off drop their atoms; returns the number of draws used."""
-    n_crossings, n, n_drawn = len(row) * len(col), 0, 0
-    goals, luck = np.empty(n_crossings, np.int64), np.empty(n_crossings)
-    for i in range(len(row)):
-        for j in range(len(col)):
-            if row[i, ON_END] * col[j, ON_END] > 0.0:
-                continue
-            tweezer = tweezers[i, j]
-            before, tweezer[STATE] = tweezer[STATE], DARK
-            if before == DARK:
-                continue
-            r, c, away_m, inside = nearest_site(row[i, END], col[j, END], sites, constants)
-            site = sites[r, c]
-            if before != HELD:
-                if inside and site[ATOM] and away_m <= constants[TOLERANCE] * constants[SPACING]:
-                    land_empty(site, now_s, tweezer, constants, tables)
-                continue
-            by_heat, by_hand_over, in_motion, heat = risks(
-                site[TRAP_DEPTH], tweezer, away_m, n_further, factor, constants, tables
-            )
-            draw = draws[n_drawn]
-            n_drawn += 1
-            if not inside:
-                lost[EJECTED] += 1
-            elif draw[0] < by_heat or draw[1] < by_hand_over:
-                lost[HAND_OVER] += 1
-            elif draw[2] < in_motion:
-                lost[TRANSPORT] += 1
-            else:
-                goals[n] = r * sites.shape[1] + c
-                luck[n] = (draw[2] - in_motion) / (1.0 - in_motion)  # uniform, as the draw was not below it
-                site[ATOM_HEAT], site[HEAT_AT_S], site[HAZARD] = heat, now_s, 0.0
-                n += 1
-    lost[COLLISION] += land(sites, goals, luck, n, constants[PAIR_SURVIVAL])
+    now_s, n, n_drawn = segment.start_s + segment.duration_s, 0, 0
+    goals, luck = np.empty(len(tweezers), np.int64), np.empty(len(tweezers))
+    for tweezer in tweezers:
+        if tweezer.stays_on or tweezer.state == DARK:
+            continue
+        before, tweezer.state = tweezer.state, DARK
+        r, c, away_m, inside = nearest_site(tweezer.to_row, tweezer.to_col, sites, constants)
+        site = sites[r, c]
+        if before != HELD:
+            if inside and site.atom and away_m <= constants.site_tolerance * constants.spacing:
+                land_empty(site, tweezer, now_s, constants)
+            continue
+        risk = risks(site.depth, tweezer, away_m, segment.n_further, segment.factor, constants)
+        draw = draws[n_drawn]
+        n_drawn += 1
+        if not inside:
+            lost.ejected += 1
+        elif survives(risk, draw, lost):
+            goals[n] = r * sites.shape[1] + c
+            luck[n] = (draw[2] - risk.motion) / (1.0 - risk.motion)  # uniform, as the draw was not below it
+            site.heat, site.since_s, site.hazard = risk.temperature, now_s, 0.0
+            n += 1
+    lost.collision += land(sites, goals, luck, n, constants.pair_survival)
     return n_drawn
 
 
-@helper_kernel(f"int64({OFFSETS}, int64)")
-def max_tones(offsets: Offsets, n_segments: int) -> int:
-    """Largest number of tones of an axis in one of the first segments."""
-    most = 0
-    for k in range(n_segments):
-        most = max(most, offsets[k + 1] - offsets[k])
-    return most
-
-
-@helper_kernel(
-    f"int64({SITES}, float64, {TABLE}, {TABLE}, {TWEEZERS}, float64, int64, float64, {TABLE}, {VECTOR}, "
-    f"{TABLE}, {VECTOR}, {NUMBERS})"
-)
+@helper_kernel()
 def play(
-    sites: Floats, now_s: float, row: Floats, col: Floats, tweezers: Floats, duration_s: float, kind: int,
-    factor: float, draws: Floats, constants: Floats, merging: Floats, tables: Floats, lost: Ints,
+    sites: Records, row: Records, col: Records, crossings: Records, segment: Segment, draws: Floats,
+    constants: Constants, merging: Floats, lost: Losses,
 ) -> int:  # fmt: skip
     """Rules 2 to 6 for a segment; returns the number of draws used."""
-    n_further = count_lit(row) + count_lit(col) - 2
-    for i in range(len(row)):
-        for j in range(len(col)):
-            start, end = row[i, POWER_START] * col[j, POWER_START], row[i, POWER_END] * col[j, POWER_END]
-            tweezers[i, j, DEPTH] = mobile_depth(max(start, end), n_further, constants)
-    pick_up(sites, now_s, row, col, tweezers, constants, merging)
-    lost[COLLISION] += mix(row, col, tweezers)
-    lost[COLLISION] += sweep(sites, row, col, tweezers, constants)
-    pass_atoms(sites, now_s, row, col, tweezers, duration_s, constants, tables)
-    advance_all(row, col, tweezers, duration_s, kind, n_further, constants, tables)
-    end_s = now_s + duration_s
-    return set_down(sites, end_s, row, col, tweezers, n_further, factor, draws, constants, tables, lost)
+    tweezers = crossings.reshape(crossings.size)
+    for tweezer in tweezers:
+        power = max(tweezer.power_start, tweezer.power_end)
+        tweezer.depth = mobile_depth(power, segment.n_further, constants)
+    pick_up(sites, tweezers, segment, constants, merging)
+    mix(row, col, crossings, lost)
+    sweep(sites, tweezers, constants, lost)
+    pass_atoms(sites, tweezers, segment, constants)
+    for tweezer in tweezers:
+        if tweezer.state != DARK:
+            advance(tweezer, segment.duration_s, segment.course, segment.n_further, constants)
+    return set_down(sites, tweezers, segment, draws, constants, lost)
 
 
 @kernel(
-    f"{NUMBERS}({SITES}, float64, {TABLE}, {OFFSETS}, {TABLE}, {OFFSETS}, {VECTOR}, {const('int8', 1)}, "
-    f"int64, float64, {TABLE}, {VECTOR}, {TABLE}, {VECTOR})"
+    f"void(Array({signature(SITE)}, 2, 'C'), float64, {TONES}, {OFFSETS}, {TONES}, {OFFSETS}, {VECTOR}, "
+    f"{const('int8', 1)}, int64, float64, {TABLE}, {VECTOR}, UniTuple(float64, {N_NUMBERS}), {TABLE}, "
+    f"{signature(LOSSES)})"
 )
 def carry_atoms(
-    sites: Floats, now_s: float, rows: Floats, row_offsets: Offsets, cols: Floats, col_offsets: Offsets,
-    duration_s: Floats, kinds: NDArray[np.int8], n_segments: int, factor: float, draws: Floats,
-    constants: Floats, merging: Floats, tables: Floats,
-) -> Ints:  # fmt: skip
+    sites: Records, now_s: float, rows: Records, row_offsets: Offsets, cols: Records, col_offsets: Offsets,
+    duration_s: Floats, courses: NDArray[np.int8], n_segments: int, factor: float, draws: Floats,
+    tables: Floats, numbers: Any, merging: Floats, lost: Losses,
+) -> None:  # fmt: skip
     """Carry atoms by the first segments of a program.
 
     Args:
         sites: The sites and their atoms; changed in place.
         now_s: When the program starts.
-        rows: Row tones of all segments (n_row_tones, N_COLUMNS).
+        rows: Row tones of all segments (n_row_tones,).
         row_offsets: The first of each segment (at least n_segments + 1,).
         cols: Column tones, likewise.
         col_offsets: Likewise.
         duration_s: Durations of the segments.
-        kinds: Their courses of the frequency.
+        courses: Their courses of the frequency.
         n_segments: Number of segments played.
-        factor: The shot's factor on the transport loss.
-        draws: Uniform random numbers (at least :func:`max_drop_offs`, 3).
-        constants: The constants.
+        factor: The shot's factor on the losses.
+        draws: Uniform random numbers (at least :func:`max_drop_offs`, N_DRAWS).
+        tables: The tables of a move, see :func:`labseq_virtual.responses.move_tables`.
+        numbers: The constants without the tables, a tuple (N_NUMBERS,).
         merging: The merging distances, see :func:`labseq_virtual.tweezer_kernels.takes`.
-        tables: The tables.
-
-    Returns:
-        Number of atoms lost by each cause (5,), without those that the hazards will cost.
+        lost: The losses so far, without those that the hazards will cost; changed in place.
     """
-    shape = max_tones(row_offsets, n_segments), max_tones(col_offsets, n_segments), N_TWEEZER
-    old, tweezers = np.zeros(shape), np.zeros(shape)
-    lost, n_drawn = np.zeros(5, np.int64), 0
-    old_row, old_col = rows[:0], cols[:0]
+    constants = Constants(tables, *numbers)
+    n_drawn, old_row, old_col = 0, rows[:0], cols[:0]
+    old = np.zeros((0, 0), TWEEZER)
     for k in range(n_segments):
         row, col = rows[row_offsets[k] : row_offsets[k + 1]], cols[col_offsets[k] : col_offsets[k + 1]]
-        lost[PROGRAM] += count_held(old, old_row, old_col)
-        if any_lit(row, col):
-            follow(old_row, old_col, old, row, col, tweezers, constants[TOLERANCE])
-            lost[PROGRAM] -= count_held(tweezers, row, col)
-            n_drawn += play(
-                sites, now_s, row, col, tweezers, duration_s[k], kinds[k], factor, draws[n_drawn:],
-                constants, merging, tables, lost,
-            )  # fmt: skip
-            old_row, old_col, old, tweezers = row, col, tweezers, old
-        else:
-            old_row, old_col = row[:0], col[:0]
+        by_row, by_col = count_lit(row), count_lit(col)
+        if by_row.start * by_col.start + by_row.end * by_col.end == 0:  # no tweezer is on
+            row, col = row[:0], col[:0]
+        tweezers = follow(old_row, old_col, old, row, col, constants.site_tolerance)
+        lost.program += count_held(old) - count_held(tweezers)
+        segment = Segment(now_s, duration_s[k], courses[k], by_row.any + by_col.any - 2, factor)
+        n_drawn += play(sites, row, col, tweezers, segment, draws[n_drawn:], constants, merging, lost)
+        old_row, old_col, old = row, col, tweezers
         now_s += duration_s[k]
-    lost[PROGRAM] += count_held(old, old_row, old_col)
-    return lost
+    lost.program += count_held(old)

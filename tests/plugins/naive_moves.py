@@ -1,6 +1,6 @@
 """What moves do to an atom, as plainly as it can be written: formulas, and tables looked up by scipy.
 
-Nothing here calls a kernel; the columns of a tweezer are those of ``labseq_virtual.tweezer_kernels``.
+Nothing here calls a kernel; a tweezer is a record of ``labseq_virtual.tweezer_kernels.TWEEZER``.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from labseq_virtual import tweezer_kernels as columns
-from labseq_virtual.handover import HELD, merging_distance, noise_hz
+from labseq_virtual.handover import merging_distance, noise_hz
 from labseq_virtual.responses import AXES, tables
 from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.tweezer_kernels import HELD
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.special import ndtr
@@ -87,11 +87,11 @@ class NaiveMoves:
         place = ramp_s * self.quicker(static), away_m / self.settings.static_waist, mobile / static
         return look_up(name, *place, self.temperature(heat, static))
 
-    def at_once(self, name: str, tweezer: Floats, speed_m_s: float, ramp_s: float, heat: float) -> None:
+    def at_once(self, name: str, tweezer: Any, speed_m_s: float, ramp_s: float, heat: float) -> None:
         """A start directly after a ramp, or a stop directly before one."""
         static = self.settings.static_depth
         if ramp_s < 10e-6:
-            depth = tweezer[columns.PEAK if name == "stop" else columns.DEPTH]
+            depth = tweezer.peak if name == "stop" else tweezer.depth
             place = ramp_s, self.speed(speed_m_s, static), depth / static, heat * DEPTH_K / static
             affect(tweezer, look_up(name, *place))
 
@@ -104,74 +104,74 @@ class NaiveMoves:
         part = ndtr((needed - mobile) / scatter) if scatter else np.heaviside(needed - mobile, 0.5)
         return float(self.light.shallow_loss * part)
 
-    def settle(self, tweezer: Floats) -> None:
+    def settle(self, tweezer: Any) -> None:
         """The pick-up, once."""
-        if tweezer[columns.IS_PICKED] == 0.0:
-            tweezer[columns.IS_PICKED] = 1.0
-            place = tweezer[[columns.SITE_DEPTH, columns.PEAK, columns.AWAY, columns.RISE_S, columns.HEAT]]
-            affect(tweezer, self.hand_over("pick_up", *place.tolist()))
+        if not tweezer.is_picked:
+            tweezer.is_picked = True
+            place = tweezer.site_depth, tweezer.peak, tweezer.away, tweezer.rise_s, tweezer.heat
+            affect(tweezer, self.hand_over("pick_up", *place))
 
     def advance(
-        self, tweezer: Floats, power: Response, way: Response, duration_s: float, kind: int, n_further: int
+        self, tweezer: Any, power: Response, way: Response, duration_s: float, kind: int, n_further: int
     ) -> None:
         """A segment: ``power`` of the tones at its ends, ``way`` along columns and rows in sites."""
-        (start, end), depth = power, tweezer[columns.DEPTH]
-        tweezer[columns.PEAK] = max(tweezer[columns.PEAK], depth)
+        (start, end), depth = power, tweezer.depth
+        tweezer.peak = max(tweezer.peak, depth)
         rises, falls = start < 0.7 * end, end < 0.7 * start
-        tweezer[columns.RISE_S] += duration_s if rises else 0.0
-        tweezer[columns.FALL_S] = tweezer[columns.FALL_S] + duration_s if falls else 0.0
+        tweezer.rise_s += duration_s if rises else 0.0
+        tweezer.fall_s = tweezer.fall_s + duration_s if falls else 0.0
         warming_hz = noise_hz(self.settings) * depth / self.settings.static_depth
-        tweezer[columns.HEAT] *= math.exp(duration_s * warming_hz)
-        before, now = tweezer[[columns.DOWN, columns.RIGHT]], np.array(way) / duration_s
+        tweezer.heat *= math.exp(duration_s * warming_hz)
+        before, now = np.array([tweezer.down_hz, tweezer.right_hz]), np.array(way) / duration_s
         turned = np.linalg.norm(now - before) > 0.8 * max(np.linalg.norm(now), np.linalg.norm(before))
-        tweezer[[columns.DOWN, columns.RIGHT]] = now
+        tweezer.down_hz, tweezer.right_hz = now
         length_m = math.hypot(*way) * self.spacing_m
         if length_m == 0.0:
             if not falls:
-                tweezer[columns.REST_S] = 0.0 if rises else tweezer[columns.REST_S] + duration_s
+                tweezer.rest_s = 0.0 if rises else tweezer.rest_s + duration_s
             return
-        speed_m_s = tweezer[columns.SPEED] = length_m / duration_s
-        tweezer[columns.STOP_SPEED] = speed_m_s if kind == 0 else 0.0
+        speed_m_s = tweezer.speed = length_m / duration_s
+        tweezer.stop_speed = speed_m_s if kind == 0 else 0.0
         fastest = speed_m_s * (1.0, 1.875, 1.5)[kind]
-        tweezer[columns.RISK] = max(tweezer[columns.RISK], self.fall(depth, fastest, n_further))
-        if tweezer[columns.STATE] == HELD and turned:
+        tweezer.risk = max(tweezer.risk, self.fall(depth, fastest, n_further))
+        if tweezer.state == HELD and turned:
             self.start(tweezer, speed_m_s, length_m, kind)
-        tweezer[columns.REST_S] = 0.0
+        tweezer.rest_s = 0.0
 
-    def start(self, tweezer: Floats, speed_m_s: float, length_m: float, kind: int) -> None:
+    def start(self, tweezer: Any, speed_m_s: float, length_m: float, kind: int) -> None:
         """A new leg of the way of an atom."""
-        is_first, static = tweezer[columns.IS_PICKED] == 0.0, self.settings.static_depth
+        is_first, static = not tweezer.is_picked, self.settings.static_depth
         self.settle(tweezer)
-        heat = tweezer[columns.LEG_HEAT] = tweezer[columns.HEAT]
+        heat = tweezer.leg_heat = tweezer.heat
         speed = self.speed(speed_m_s, static)
         if kind > 0:  # the acceleration counts; the table's moves are over four sites
             speed *= math.sqrt(4 * SITE_M / max(length_m, 0.1 * SITE_M))
-        place = kind, speed, tweezer[columns.DEPTH] / static, heat * DEPTH_K / static
+        place = kind, speed, tweezer.depth / static, heat * DEPTH_K / static
         affect(tweezer, look_up("transport", *place))
         if is_first and kind == 0:
-            ramp_s = tweezer[columns.RISE_S] + tweezer[columns.REST_S]
+            ramp_s = tweezer.rise_s + tweezer.rest_s
             self.at_once("start", tweezer, speed_m_s, ramp_s, heat)
 
     def risks(
-        self, static: float, tweezer: Floats, away_m: float, n_further: int, factor: float
+        self, static: float, tweezer: Any, away_m: float, n_further: int, factor: float
     ) -> tuple[float, float, float, float]:
         """Of a drop-off: loss by heat, by the hand-over, and in motion; and the temperature afterwards."""
         self.settle(tweezer)
-        peak, fall_s = tweezer[columns.PEAK], tweezer[columns.FALL_S]
-        if tweezer[columns.STOP_SPEED] > 0.0:
-            ramp_s = tweezer[columns.REST_S] + fall_s
-            self.at_once("stop", tweezer, tweezer[columns.STOP_SPEED], ramp_s, tweezer[columns.LEG_HEAT])
+        peak, fall_s = tweezer.peak, tweezer.fall_s
+        if tweezer.stop_speed > 0.0:
+            ramp_s = tweezer.rest_s + fall_s
+            self.at_once("stop", tweezer, tweezer.stop_speed, ramp_s, tweezer.leg_heat)
         deeper = peak / static / (self.light.depth / self.settings.static_depth)
         by_hand_over = min(1.0, factor * self.settings.transport_loss * deeper)
         per_tone = min(1.0, factor * self.settings.transport_loss_per_tone * n_further)
-        place = static, peak, away_m, fall_s, tweezer[columns.HEAT]
+        place = static, peak, away_m, fall_s, tweezer.heat
         loss, warmer = self.hand_over("drop_off", *place)
-        by_heat = 1 - (1 - tweezer[columns.LOST]) * (1 - loss)
-        in_motion = 1 - (1 - per_tone) * (1 - tweezer[columns.RISK])
-        return by_heat, by_hand_over, in_motion, tweezer[columns.HEAT] * warmer
+        by_heat = 1 - (1 - tweezer.lost) * (1 - loss)
+        in_motion = 1 - (1 - per_tone) * (1 - tweezer.risk)
+        return by_heat, by_hand_over, in_motion, tweezer.heat * warmer
 
 
-def affect(tweezer: Floats, response: Response) -> None:
+def affect(tweezer: Any, response: Response) -> None:
     loss, warmer = response
-    tweezer[columns.LOST] = 1 - (1 - tweezer[columns.LOST]) * (1 - loss)
-    tweezer[columns.HEAT] *= warmer
+    tweezer.lost = 1 - (1 - tweezer.lost) * (1 - loss)
+    tweezer.heat *= warmer

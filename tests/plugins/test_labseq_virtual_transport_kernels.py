@@ -13,26 +13,12 @@ import pytest
 from hypothesis import event, given, settings, strategies as st
 from labseq_virtual import tweezer_kernels as kernels
 from labseq_virtual.atoms import Atoms
-from labseq_virtual.handover import (
-    AT_REST,
-    EMPTY,
-    END,
-    HELD,
-    MIXING,
-    ON_END,
-    ON_START,
-    POWER_END,
-    POWER_START,
-    START,
-    constants,
-    merging_distance,
-    pair_survival,
-)
+from labseq_virtual.handover import merging_distance, pair_survival
 from labseq_virtual.response_kernels import at_once, carry, hand_over, land_on, pass_by
-from labseq_virtual.responses import move_tables
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.transport import Transport
-from labseq_virtual.transport_kernels import max_drop_offs, one_left
+from labseq_virtual.transport_kernels import AT_REST, MIXING, max_drop_offs, one_left
+from labseq_virtual.tweezer_kernels import EMPTY, HELD, Constants, constants
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
@@ -51,9 +37,9 @@ def count(mask: Mask) -> int:
     return int(np.count_nonzero(mask))
 
 
-def crossings(row: Floats, col: Floats, column: int) -> Any:
+def crossings(row: Any, col: Any, column: str) -> Any:
     """A product of row tones and column tones, (n_row_tones, n_column_tones)."""
-    return row[:, column, None] * col[:, column]
+    return 1.0 * row[column][:, None] * col[column]
 
 
 def _followed(away: Floats, tolerance: float) -> Mask:
@@ -67,12 +53,12 @@ def _followed(away: Floats, tolerance: float) -> Mask:
 class Before:
     """The crossings at the end of the segment before."""
 
-    row: Floats
-    col: Floats
+    row: Any
+    col: Any
     lit: Mask
     loaded: Mask
     fresh: Mask
-    course: Floats
+    course: Any
 
 
 class NaiveTransport:
@@ -106,26 +92,26 @@ class NaiveTransport:
             occupied &= ~taken
         return +self.lost
 
-    def _segments(self, program: ToneProgram, axis: int) -> list[Floats]:
+    def _segments(self, program: ToneProgram, axis: int) -> list[Any]:
         tones = self.transport._tones(program, axis)
         offsets = (program.row, program.column)[axis].offsets
         return [tones[first:last] for first, last in pairwise(offsets)]
 
     def _segment(
-        self, before: Before | None, row: Floats, col: Floats, duration_s: float, kind: int
+        self, before: Before | None, row: Any, col: Any, duration_s: float, kind: int
     ) -> Before | None:
-        lit_start, lit_end = crossings(row, col, ON_START) > 0, crossings(row, col, ON_END) > 0
+        lit_start, lit_end = crossings(row, col, "on_start") > 0, crossings(row, col, "on_end") > 0
         lit = lit_start | lit_end
         self.lost["program"] += 0 if before is None else count(before.loaded)
         if not lit.any():
             return None
-        further = sum(count((tones[:, ON_START] + tones[:, ON_END]) > 0) for tones in (row, col)) - 2
+        further = sum(count(tones["on_start"] | tones["on_end"]) for tones in (row, col)) - 2
         on, loaded, fresh, course = self._continued(before, row, col)
         goes_on = on & lit_start
         loaded, fresh = loaded & lit_start, (fresh & goes_on) | (lit & ~goes_on)
-        course[~goes_on] = 0.0
+        course[~goes_on] = np.zeros(1, kernels.TWEEZER)[0]
         self.lost["program"] -= count(loaded)
-        start, end = crossings(row, col, POWER_START), crossings(row, col, POWER_END)
+        start, end = crossings(row, col, "power_start"), crossings(row, col, "power_end")
         power = np.maximum(start, end)
         depth = self.moves.mobile_depth(power, further)
         taken = self._picked_up(fresh, depth, course, row, col)
@@ -134,11 +120,11 @@ class NaiveTransport:
         mixed = self._mixed(row)[:, None] | self._mixed(col)
         self.lost["collision"] += count(loaded & mixed)
         loaded &= ~mixed
-        down, right = (row[:, END] - row[:, START])[:, None], (col[:, END] - col[:, START])[None, :]
+        down, right = (row["end"] - row["start"])[:, None], (col["end"] - col["start"])[None, :]
         if (np.abs(down) > AT_REST).any() or (np.abs(right) > AT_REST).any():
             self._sweep(lit & (depth > self.settings.static_depth), loaded, course, row, col)
         self._pass(lit, loaded, course, depth, row, col, duration_s)
-        course[..., kernels.STATE], course[..., kernels.DEPTH] = np.where(loaded, HELD, EMPTY), depth
+        course["state"], course["depth"] = np.where(loaded, HELD, EMPTY), depth
         for i, j in np.argwhere(lit):
             way = float(down[i, 0]), float(right[0, j])
             self.moves.advance(course[i, j], (start[i, j], end[i, j]), way, duration_s, kind, further)
@@ -146,12 +132,12 @@ class NaiveTransport:
         self._set_down(loaded & ~lit_end, course, row, col, further, duration_s)
         return Before(row, col, lit_end, loaded & lit_end, fresh, course)
 
-    def _continued(self, before: Before | None, row: Floats, col: Floats) -> tuple[Mask, Mask, Mask, Floats]:
+    def _continued(self, before: Before | None, row: Any, col: Any) -> tuple[Mask, Mask, Mask, Any]:
         if before is None:
             dark = np.zeros((len(row), len(col)), np.bool_)
-            return dark, dark.copy(), dark.copy(), np.zeros((*dark.shape, kernels.N_TWEEZER))
+            return dark, dark.copy(), dark.copy(), np.zeros(dark.shape, kernels.TWEEZER)
         pairs = (row, before.row), (col, before.col)
-        away: list[Any] = [np.abs(now[:, START, None] - then[:, END]) for now, then in pairs]
+        away: list[Any] = [np.abs(now["start"][:, None] - then["end"]) for now, then in pairs]
         tolerance = self.settings.site_tolerance
         source: Any = np.ix_(*(each.argmin(axis=1) for each in away))
         close: Any = np.logical_and.outer(*(_followed(each, tolerance) for each in away))
@@ -159,7 +145,7 @@ class NaiveTransport:
         lit, loaded, fresh = (mask[source] & close for mask in old)
         return lit, loaded, fresh, before.course[source]
 
-    def _nearest(self, row: Floats, col: Floats) -> Any:
+    def _nearest(self, row: Any, col: Any) -> Any:
         r, c = np.rint(row), np.rint(col)
         down, right = row - r, col - c
         a1, a2 = GRID.axes
@@ -168,8 +154,10 @@ class NaiveTransport:
         r, c = np.clip(r, 0, GRID.n_rows - 1), np.clip(c, 0, GRID.n_cols - 1)
         return r.astype(int), c.astype(int), np.sqrt(square), inside
 
-    def _picked_up(self, new: Mask, depth: Any, course: Floats, row: Floats, col: Floats) -> Mask:
-        r, c, away_m, inside = self._nearest(*np.broadcast_arrays(row[:, START, None], col[None, :, START]))
+    def _picked_up(self, new: Mask, depth: Any, course: Any, row: Any, col: Any) -> Mask:
+        r, c, away_m, inside = self._nearest(
+            *np.broadcast_arrays(row["start"][:, None], col["start"][None, :])
+        )
         taken = new & inside & self.occupied[r, c]
         for i, j in np.argwhere(taken):
             site = r[i, j], c[i, j]
@@ -179,20 +167,21 @@ class NaiveTransport:
             if taken[i, j]:
                 waited_s = self.now_s - self.thermal[1][site]
                 heat = self.moves.relaxed(self.thermal[0][site], waited_s)
-                course[i, j, kernels.SITE_DEPTH : kernels.HEAT + 1] = static, away_m[i, j], heat
-                course[i, j, kernels.IS_PICKED] = 0.0
-                course[i, j, kernels.LOST] = 1 - np.exp(-self.hazards[site])
+                tweezer = course[i, j]
+                tweezer.site_depth, tweezer.away, tweezer.heat = static, away_m[i, j], heat
+                course[i, j].is_picked = False
+                course[i, j].lost = 1 - np.exp(-self.hazards[site])
                 self.hazards[site] = 0.0
         return taken
 
     def _pass(
-        self, lit: Mask, loaded: Mask, course: Floats, depth: Any, row: Floats, col: Floats, duration_s: float
+        self, lit: Mask, loaded: Mask, course: Any, depth: Any, row: Any, col: Any, duration_s: float
     ) -> None:
         """Tweezers pass atoms where they are nearest to them: on the way, or where they stop or turn away."""
         a1, a2 = GRID.axes
         for i, j in np.argwhere(lit):
-            start, end = (row[i, at] * a2 + col[j, at] * a1 for at in (START, END))
-            was = course[i, j, kernels.DOWN] * a2 + course[i, j, kernels.RIGHT] * a1
+            start, end = (row[i][at] * a2 + col[j][at] * a1 for at in ("start", "end"))
+            was = course[i, j].down_hz * a2 + course[i, j].right_hz * a1
             way = end - start
             for r, c in np.argwhere(self.occupied):
                 to = r * a2 + c * a1 - start
@@ -210,23 +199,23 @@ class NaiveTransport:
                 self.thermal[:, r, c] = heat * warmer, self.now_s
                 self.hazards[r, c] -= np.log1p(-min(loss, 1 - 1e-9))
                 if loaded[i, j]:
-                    course[i, j, kernels.LOST] = 1 - (1 - course[i, j, kernels.LOST]) * (1 - loss)
+                    course[i, j].lost = 1 - (1 - course[i, j].lost) * (1 - loss)
 
-    def _mixed(self, tones: Floats) -> Any:
-        on = (tones[:, ON_START] + tones[:, ON_END]) > 0
-        before, after = (tones[:, at, None] - tones[:, at] for at in (START, END))
+    def _mixed(self, tones: Any) -> Any:
+        on = tones["on_start"] | tones["on_end"]
+        before, after = (tones[at][:, None] - tones[at] for at in ("start", "end"))
         near = (np.abs(before) < MIXING) | (np.abs(after) < MIXING) | (before * after < 0)
         near &= on[:, None] & on & ~np.eye(len(tones), dtype=np.bool_)
         return near.any(axis=1)
 
-    def _sweep(self, strong: Mask, loaded: Mask, course: Floats, row: Floats, col: Floats) -> None:
-        row_step, col_step = row[:, END] - row[:, START], col[:, END] - col[:, START]
+    def _sweep(self, strong: Mask, loaded: Mask, course: Any, row: Any, col: Any) -> None:
+        row_step, col_step = row["end"] - row["start"], col["end"] - col["start"]
         i, j = np.nonzero(strong & ((np.abs(row_step) > AT_REST)[:, None] | (np.abs(col_step) > AT_REST)))
         r, c = np.nonzero(self.occupied)
         if len(i) == 0 or len(r) == 0:
             return
         down, right = row_step[i, None], col_step[j, None]  # (n_crossings, 1), against (n_atoms,)
-        to_r, to_c = r - row[i, START, None], c - col[j, START, None]
+        to_r, to_c = r - row[i]["start"][:, None], c - col[j]["start"][:, None]
         when = np.clip((to_r * down + to_c * right) / (down**2 + right**2), 0.0, 1.0)
         miss = (to_r - when * down) ** 2 + (to_c - when * right) ** 2
         hit: Any = miss <= self.settings.site_tolerance**2
@@ -240,18 +229,18 @@ class NaiveTransport:
             loaded[i[first], j[first]] = False
         for k in np.argmin(np.where(hit, when, np.inf), axis=0)[struck]:
             if loaded[i[k], j[k]]:
-                course[i[k], j[k], kernels.LOST] = 1 - (1 - course[i[k], j[k], kernels.LOST]) * pairs
+                course[i[k], j[k]].lost = 1 - (1 - course[i[k], j[k]].lost) * pairs
         self.occupied[r[struck], c[struck]] = False
 
-    def _land(self, empty: Mask, course: Floats, row: Floats, col: Floats, duration_s: float) -> None:
+    def _land(self, empty: Mask, course: Any, row: Any, col: Any, duration_s: float) -> None:
         now_s = self.now_s + duration_s
         for i, j in np.argwhere(empty):
-            r, c, away_m, inside = (each[()] for each in self._nearest(row[i, END], col[j, END]))
-            if not (inside and self.occupied[r, c] and course[i, j, kernels.SPEED] > 0):
+            r, c, away_m, inside = (each[()] for each in self._nearest(row[i]["end"], col[j]["end"]))
+            if not (inside and self.occupied[r, c] and course[i, j].speed > 0):
                 continue
             if away_m > self.settings.site_tolerance * GRID.spacing_m:
                 continue
-            peak, speed, fall_s = course[i, j, [kernels.PEAK, kernels.SPEED, kernels.FALL_S]]
+            peak, speed, fall_s = course[i, j].peak, course[i, j].speed, course[i, j].fall_s
             heat = self.moves.relaxed(self.thermal[0, r, c], now_s - self.thermal[1, r, c])
             static = float(self.depth[r, c])
             loss, warmer = self.moves.land_on(static, peak, speed, fall_s, heat)
@@ -261,14 +250,14 @@ class NaiveTransport:
     def _set_down(
         self,
         dropping: Mask,
-        course: Floats,
-        row: Floats,
-        col: Floats,
+        course: Any,
+        row: Any,
+        col: Any,
         further: int,
         duration_s: float,
     ) -> None:
         i, j = np.nonzero(dropping)
-        r, c, away_m, inside = self._nearest(row[i, END], col[j, END])
+        r, c, away_m, inside = self._nearest(row[i]["end"], col[j]["end"])
         args = zip(self.depth[r, c], course[i, j], away_m, strict=True)
         found = [self.moves.risks(*one, further, self.factor) for one in args]
         risks, heat = np.array(found).reshape(-1, 4)[:, :3], np.array(found).reshape(-1, 4)[:, 3]
@@ -395,7 +384,7 @@ WAIST_M = 0.98e-6
 REACH = np.stack(merging_distance(WAIST_M, WAIST_M))
 
 
-def constants_of(light: dict[str, Any] | None = None, **simulation: Any) -> NDArray[np.float64]:
+def constants_of(light: dict[str, Any] | None = None, **simulation: Any) -> Constants:
     return constants(
         SiteGrid(), SimulationSettings.model_validate({**simulation, "mobile_light": light or {}})
     )
@@ -417,18 +406,18 @@ def test_a_mobile_tweezer_takes_only_from_a_shallower_one() -> None:
     assert taken == [False, False, True]
 
 
-def course_of(**values: float) -> Floats:
-    """The course of a tweezer that picked an atom up on a site of nominal depth, by default the paper's."""
-    paper = {"PEAK": 2.1e-3, "RISE_S": 60e-6, "FALL_S": 60e-6, "SITE_DEPTH": 300e-6, "HEAT": 15e-6}
-    course = np.zeros(kernels.N_TWEEZER)
-    for name, value in (paper | {"STATE": HELD, "DEPTH": 2.1e-3} | values).items():
-        course[getattr(kernels, name)] = value
-    return course
+def course_of(**values: float) -> Any:
+    """A tweezer that picked an atom up on a site of nominal depth, by default the paper's."""
+    paper = {"peak": 2.1e-3, "rise_s": 60e-6, "fall_s": 60e-6, "site_depth": 300e-6, "heat": 15e-6}
+    course = np.zeros(1, kernels.TWEEZER)
+    for name, value in (paper | {"state": HELD, "depth": 2.1e-3} | values).items():
+        course[name] = value
+    return course[0]
 
 
-def risks(course: Floats, static: float = 300e-6, away_m: float = 0.0, **simulation: Any) -> Any:
+def risks(course: Any, static: float = 300e-6, away_m: float = 0.0, **simulation: Any) -> Any:
     physics = constants_of(None, **{"transport_loss": 0.0} | simulation)
-    return kernels.risks(static, course, away_m, 5, 1.5, physics, move_tables())
+    return kernels.risks(static, course, away_m, 5, 1.5, physics)
 
 
 def test_a_static_tweezer_that_is_off_holds_nothing_back() -> None:
@@ -461,20 +450,20 @@ BETWEEN = [
 def test_between_the_points_of_the_tables_atoms_fare_as_newtons_equations_say(stage: int, args: Any) -> None:
     lost, warmer = [*SCRIPT.STAGES.values()][stage](*args, SCRIPT.REFERENCE)
     first, other, ratio, heat = args
-    physics, depth_k, tables = constants_of(static_waist=WAIST_M), 300e-6, move_tables()
+    physics, depth_k = constants_of(static_waist=WAIST_M), 300e-6
     mobile_k = ratio * depth_k
     if stage == TRANSPORT:
-        found = carry(first, other, 4 * 4.49e-6, mobile_k, heat, physics, tables)
+        found = carry(first, other, 4 * 4.49e-6, mobile_k, heat, physics)
     elif stage == LANDING:
-        found = land_on(depth_k, mobile_k, first, other, heat, physics, tables)
+        found = land_on(depth_k, mobile_k, first, other, heat, physics)
     elif stage == PASSING:
-        found = pass_by(depth_k, mobile_k, first, other * WAIST_M, heat, physics, tables)
+        found = pass_by(depth_k, mobile_k, first, other * WAIST_M, heat, physics)
         assert 0.01 < found[0] < 2 * lost < 4 * found[0]
     elif stage in (STARTING, STOPPING):
-        found = at_once(stage - STARTING, mobile_k, other, first, heat, physics, tables)
+        found = at_once(stage, mobile_k, other, first, heat, physics)
         assert lost > 0.15
     else:
-        found = hand_over(stage, depth_k, mobile_k, other * WAIST_M, first, heat, physics, tables)
+        found = hand_over(stage, depth_k, mobile_k, other * WAIST_M, first, heat, physics)
         assert found[1] == pytest.approx(warmer, rel=0.25)
     assert found[0] == pytest.approx(lost, abs=0.2 if stage in (TRANSPORT, STARTING, STOPPING) else 0.08)
 
@@ -485,17 +474,20 @@ def test_between_the_points_of_the_tables_atoms_fare_as_newtons_equations_say(st
 def test_the_hand_over_loss_goes_as_the_ratio_of_the_depths(
     static: float, mobile: float, lost: float
 ) -> None:
-    _, hand_over, transport, _ = risks(course_of(PEAK=mobile), static, transport_loss=0.02)
+    _, hand_over, transport, _ = risks(course_of(peak=mobile), static, transport_loss=0.02)
     assert hand_over == pytest.approx(lost)
     assert transport == 0.0
+
+
+FIVE_SITES = {"to_col": 5.0, "power_start": 1.0, "power_end": 1.0}
 
 
 def test_the_move_of_the_paper_loses_nothing_to_heat_and_faster_ones_do() -> None:
     losses: list[float] = []
     for speed_um_ms in (130.0, 160.0, 330.0, 3000.0):
-        course, segment_s = course_of(), 5 * 4.49e-3 / speed_um_ms
-        kernels.advance(course, 1.0, 1.0, 0.0, 5.0, segment_s, 0, 5, constants_of(), move_tables())
-        course[kernels.FALL_S] = 60e-6
+        course, segment_s = course_of(**FIVE_SITES), 5 * 4.49e-3 / speed_um_ms
+        kernels.advance(course, segment_s, 0, 5, constants_of())
+        course.fall_s = 60e-6
         losses.append(risks(course)[0])
     assert losses[0] == 0.0
     assert losses[1] < 0.02
@@ -505,19 +497,18 @@ def test_the_move_of_the_paper_loses_nothing_to_heat_and_faster_ones_do() -> Non
 
 def lost_on_the_way(kind: int = 0, fall_s: float = 60e-6, **before: float) -> float:
     """Fraction of atoms lost in a move at 250 um/ms, with what was before it and a ramp after it."""
-    course = course_of(**before)
-    args = 1.0, 1.0, 0.0, 5.0, 5 * 4.49e-3 / 250.0, kind, 5, constants_of(), move_tables()
-    kernels.advance(course, *args)
-    course[kernels.FALL_S] = fall_s
+    course = course_of(**FIVE_SITES, **before)
+    kernels.advance(course, 5 * 4.49e-3 / 250.0, kind, 5, constants_of())
+    course.fall_s = fall_s
     return risks(course)[0]
 
 
 def test_short_ramps_directly_before_a_start_or_after_a_stop_cost_atoms() -> None:
     assert lost_on_the_way() < 0.05
-    assert lost_on_the_way(RISE_S=1e-6) > 0.3
-    assert lost_on_the_way(RISE_S=1e-6, REST_S=20e-6) < 0.05
+    assert lost_on_the_way(rise_s=1e-6) > 0.3
+    assert lost_on_the_way(rise_s=1e-6, rest_s=20e-6) < 0.05
     assert lost_on_the_way(fall_s=1e-6) > 0.2
-    assert lost_on_the_way(kind=1, fall_s=1e-6, RISE_S=1e-6) < 0.05
+    assert lost_on_the_way(kind=1, fall_s=1e-6, rise_s=1e-6) < 0.05
 
 
 @pytest.mark.parametrize("loading", [0.5, 0.75, 0.9])

@@ -1,0 +1,72 @@
+"""Records: what the kernels of the transport know of a tone and of a site.
+
+A class lists the columns of an array, and :func:`record` makes the array's dtype of it. ``site.depth`` then
+reads a column, in compiled code too. To add a column, add a line to its class.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, get_type_hints
+
+import numpy as np
+
+Dtype = np.dtype[Any]
+
+NUMBERS: Final[dict[Any, Any]] = {float: np.float64, int: np.int64, bool: np.bool_}
+
+
+def record(columns: type) -> Dtype:
+    """The dtype of an array with a column for each number of a class."""
+    numbers = [(name, NUMBERS[kind]) for name, kind in get_type_hints(columns).items()]
+    return np.dtype((np.record, np.dtype(numbers, align=True)))
+
+
+def signature(dtype: Dtype) -> str:
+    """The type of a record as numba writes it, for the signature of a kernel that Python calls."""
+    columns: list[str] = []
+    for name, (kind, offset, *_) in (dtype.fields or {}).items():
+        number = "boolean" if kind == np.bool_ else kind.name
+        columns.append(f"('{name}', {{'type': {number}, 'offset': {offset}}})")
+    return f"Record([{', '.join(columns)}], {dtype.itemsize}, {dtype.isalignedstruct})"
+
+
+class Tone:
+    """A tone in a segment.
+
+    Attributes:
+        start: Its position at the start, in sites.
+        end: At the end.
+        power_start: Its power at the start, relative to the intended one.
+        power_end: At the end.
+        on_start: Whether it is on at the start.
+        on_end: Whether it is on at the end.
+    """
+
+    start: float
+    end: float
+    power_start: float
+    power_end: float
+    on_start: bool
+    on_end: bool
+
+
+class Site:
+    """A site and its atom.
+
+    Attributes:
+        atom: Whether there is one.
+        depth: Depth of the static tweezer, in kelvin.
+        heat: Temperature of the atom, as it would be at the nominal depth.
+        since_s: The time that the temperature belongs to.
+        hazard: By tweezers that passed the atom: it stays with the probability ``exp(-hazard)``.
+    """
+
+    atom: bool
+    depth: float
+    heat: float
+    since_s: float
+    hazard: float
+
+
+TONE: Final = record(Tone)
+SITE: Final = record(Site)
