@@ -248,7 +248,7 @@ class VirtualSpotMeter(VirtualDriver, Device):
         self._check_open()
         if name != VALUE:
             raise DeviceError(self._name, f"unknown value '{name}'; expected '{VALUE}'")
-        self._clock.sleep(self._settings.duration)
+        self._clock.sleep(20e-3)  # of a measurement (ours)
         powers: NDArray[np.float64] = self._simulation.spot_powers()  # pyright: ignore[reportAttributeAccessIssue]
         return powers * (1 + self._settings.noise * self._random.shot.standard_normal(powers.shape))
 

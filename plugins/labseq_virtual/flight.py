@@ -150,7 +150,7 @@ class RfTransport:
         light = settings.mobile_light
         self._grid, self._motion, self._settings, self._light = grid, motion, settings, light
         self._positions = positions or TonePositions(grid, light)
-        self._full_v = full_volts(grid, motion, light.tone_voltage)
+        self._full_v = full_volts(grid, motion)
         self._bands = bands(grid)
         axes_hz = grid.row_frequency_hz, grid.column_frequency_hz
         self.reach_hz = [reach_hz(hz, motion.eject_slots) for hz in axes_hz]

@@ -104,8 +104,6 @@ def full_amplitudes(grid: SiteGrid, motion: MotionSpec) -> tuple[Floats, Floats]
     return rows, cols
 
 
-def full_volts(grid: SiteGrid, motion: MotionSpec, tone_v: float | None) -> list[Floats]:
+def full_volts(grid: SiteGrid, motion: MotionSpec) -> list[Floats]:
     """Peak voltages of the tones that give the full depth: for each axis, one per site."""
-    if tone_v is not None:
-        return [np.full(n, tone_v) for n in grid.shape]
     return [motion.rf.full_scale_v * full for full in full_amplitudes(grid, motion)]

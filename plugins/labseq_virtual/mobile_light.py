@@ -69,7 +69,7 @@ class MobileLight:
     ) -> None:
         self._grid, self._light, self._positions = grid, light, positions
         self._full = full_amplitudes(grid, motion)
-        self._full_v = full_volts(grid, motion, light.tone_voltage)
+        self._full_v = full_volts(grid, motion)
 
     def of_program(self, program: ToneProgram, t_s: float) -> MobileTones | None:
         """The tones of a program at a time from its start; None if none is on."""

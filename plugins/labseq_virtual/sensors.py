@@ -87,13 +87,10 @@ class Register:
     Attributes:
         n_stages: Number of stages.
         gain: Mean electrons out for one in; 1 is a plain CCD.
-        spurious: Mean electrons that the stages add to each pixel read, before later stages multiply
-            them, as clock-induced charge does (spread evenly over the stages).
     """
 
     n_stages: int
     gain: float
-    spurious: float = 0.0
 
     @property
     def p(self) -> float:
@@ -114,21 +111,12 @@ class Register:
 
     @cached_property
     def one(self) -> CountDistribution:
-        """Distribution of the output for one electron in, without the spurious ones."""
+        """Distribution of the output for one electron in."""
         n_values = power_of_two(45 * self.gain + 64)
-        return CountDistribution.of(
-            np.fft.irfft(_transforms(self.n_stages, self.gain, n_values)[0], n_values)
-        )
-
-    @cached_property
-    def _added(self) -> CountDistribution:
-        """Distribution of what the spurious electrons add to the output."""
-        return CountDistribution.of(
-            self.output(0.0, power_of_two((self.spurious + 9 * self.spurious**0.5 + 45) * self.gain))
-        )
+        return CountDistribution.of(np.fft.irfft(_transform(self.n_stages, self.gain, n_values), n_values))
 
     def output(self, mean_electrons: float, n_values: int) -> NDArray[np.float64]:
-        """Distribution of the output for a Poisson number of electrons in, spurious ones included.
+        """Distribution of the output for a Poisson number of electrons in.
 
         Args:
             mean_electrons: Mean number of electrons in.
@@ -137,8 +125,8 @@ class Register:
         Returns:
             float64 (n_values,), probability of 0, 1, ... electrons out.
         """
-        one, spurious = _transforms(self.n_stages, self.gain, n_values)
-        return np.fft.irfft(np.exp(mean_electrons * (one - 1) + self.spurious * spurious), n_values)
+        one = _transform(self.n_stages, self.gain, n_values)
+        return np.fft.irfft(np.exp(mean_electrons * (one - 1)), n_values)
 
     def multiply(self, n_electrons: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
         """Draw the output for each number of electrons in.
@@ -157,10 +145,6 @@ class Register:
             many = n_electrons[~few]
             odds = math.expm1(math.log(self.gain) - 2 * math.atanh(self.p))
             out[~few] += rng.negative_binomial(many * ((self.gain - 1) / odds), 1 / (1 + odds))
-        if self.spurious > 0:
-            added = np.empty(len(out), np.int32)
-            self._added.draw(added, rng)
-            out += added
         return out
 
 
@@ -170,18 +154,13 @@ def power_of_two(least: float) -> int:
 
 
 @lru_cache(maxsize=16)
-def _transforms(n_stages: int, gain: float, n_values: int) -> tuple[Complex, Complex]:
-    """Fourier transforms of a register's output for one electron, and of the mean of f_m - 1 over m.
-
-    f_m is the generating function of the last m stages.
-    """
+def _transform(n_stages: int, gain: float, n_values: int) -> Complex:
+    """Fourier transform of a register's output for one electron."""
     p = Register(n_stages, gain).p
     s: Complex = np.exp(-2j * np.pi * np.fft.rfftfreq(n_values))
-    total = np.zeros_like(s)
     for _ in range(n_stages):
-        total += s
         s *= 1 - p + p * s
-    return s, total / n_stages - 1
+    return s
 
 
 class View(ImageSettings):
@@ -269,6 +248,10 @@ class Output:
         return counts / self.electrons_per_adu + self.offset
 
 
+STAGES: Final = 536
+"""Stages of the EM register (ours: as many as in Hirsch et al., PLoS ONE 8, e53671, 2013)."""
+
+
 class Emccd:
     """An EMCCD camera.
 
@@ -284,8 +267,7 @@ class Emccd:
     def __init__(self, settings: View) -> None:
         self.binning = settings.binning
         self._settings = settings
-        gain, spurious = settings.em_gain, settings.register_clock_induced_charge
-        self.register = Register(settings.register_stages, gain, spurious)
+        self.register = Register(STAGES, settings.em_gain)
         self._output = Output(
             settings.register_well, settings.read_noise, settings.electrons_per_adu, settings.offset
         )
@@ -324,8 +306,7 @@ class Emccd:
 @lru_cache(maxsize=64)
 def _dark_counts(register: Register, output: Output, mean_electrons: float) -> CountDistribution | None:
     """Distribution of the counts of a pixel without an atom's light; None if the table would be too long."""
-    most = mean_electrons + register.spurious
-    n_values = power_of_two((most + 9 * (2 * most) ** 0.5 + 45) * register.gain)
+    n_values = power_of_two((mean_electrons + 9 * (2 * mean_electrons) ** 0.5 + 45) * register.gain)
     spread = output.read_noise / output.electrons_per_adu
     reach = int(np.ceil(6.5 * spread)) + 1
     if n_values * reach > MAX_WORK or mean_electrons > MAX_ELECTRONS:

@@ -20,7 +20,6 @@ from labseq.plugin import (
     PositiveDuration,
     Settings,
     Temperature,
-    Voltage,
     camera,
     format_quantity,
 )
@@ -146,23 +145,11 @@ class ImageSettings(Settings):
     clock_induced_charge: NonNegativeFloat = Field(
         default=0.005, description="mean spurious electrons per pixel and frame (ours: typical of EMCCDs)"
     )
-    register_clock_induced_charge: NonNegativeFloat = Field(
-        default=0.0,
-        le=10,
-        description="mean spurious electrons that the stages of the EM register add to each pixel read, each "
-        "multiplied only by the stages after it (ours)",
-    )
     em_gain: float = Field(
         default=300.0,
         ge=1,
         le=2000,
         description="mean gain of the EM register where the camera sets none; 1: a plain CCD (ours)",
-    )
-    register_stages: int = Field(
-        default=536,
-        ge=100,
-        le=2000,
-        description="stages of the EM register (ours: as many as in Hirsch et al., PLoS ONE 8, e53671, 2013)",
     )
     full_well: float = Field(
         default=180e3, ge=1000, description="electrons that a pixel holds (ours: typical)"
@@ -183,6 +170,10 @@ class ImageSettings(Settings):
     )
 
 
+TWEEZER_EXPOSURE_S = 1e-3
+"""Exposure that the photoelectrons of ``tweezer_image`` belong to (ours)."""
+
+
 class TweezerImageSettings(Settings):
     """The image of a further camera: the light of the tweezers, and none of atoms.
 
@@ -199,24 +190,10 @@ class TweezerImageSettings(Settings):
         default=(255.5, 255.5), description="[y, x] of the grid's centre in pixels (ours: the middle)"
     )
     angle: Angle = Field(default=0.0, description="rotation of the grid on the frame, clockwise (ours)")
-    spot: PositiveLength = Field(
-        default=0.42e-6, description="width (1 sigma of a Gaussian) of a tweezer in the atom plane (ours)"
-    )
-    exposure: PositiveDuration = Field(
-        default=1e-3, description="exposure that the photoelectrons belong to (ours)"
-    )
     tweezer_light: NonNegativeFloat = Field(
         default=20e3,
-        description="mean photoelectrons of the light of a static tweezer of nominal power in that exposure "
-        "(ours: in three times this exposure its pixels are saturated)",
-    )
-    mobile_light: NonNegativeFloat = Field(
-        default=140e3,
-        description="the same of a mobile tweezer whose tones have their intended amplitudes (ours: seven "
-        "times as deep)",
-    )
-    background: NonNegativeFloat = Field(
-        default=5.0, description="mean photoelectrons of stray light per pixel in that exposure (ours)"
+        description="mean photoelectrons of the light of a static tweezer of nominal power in 1 ms (ours: in "
+        "three times this exposure its pixels are saturated); a mobile one gives seven times as many",
     )
 
     def image(self) -> ImageSettings:
@@ -224,8 +201,10 @@ class TweezerImageSettings(Settings):
         sensor = QcmosSettings(
             quantum_efficiency=1.0, read_noise=2.0, electrons_per_adu=0.1, full_well=7000.0
         )
-        optics = self.model_dump(exclude={"mobile_light"})
-        return ImageSettings.model_validate({**optics, "sensor": "qcmos", "qcmos": sensor})
+        light = {"exposure": TWEEZER_EXPOSURE_S, "background": 5.0}  # electrons per pixel (ours)
+        return ImageSettings.model_validate(
+            {**self.model_dump(), **light, "sensor": "qcmos", "qcmos": sensor}
+        )
 
 
 PositiveTemperature = Annotated[Temperature, Field(gt=0)]
@@ -262,11 +241,6 @@ class MobileLightSettings(Settings):
         default=10e-6,
         description="time that the sound takes across the beam in an AOD (1/e^2 of the intensity at both "
         "ends); it smooths every jump of a tone (ours: 6 mm of slow TeO2)",
-    )
-    tone_voltage: Annotated[Voltage, Field(gt=0)] | None = Field(
-        default=None,
-        description="peak voltage of a tone at the driver's output that gives the depth (ours; none: that "
-        "of the profile, `rf.full_scale` times the site's preassigned amplitude or over its axis' tones)",
     )
     tone_response: Fraction = Field(
         default=0.0,
@@ -369,11 +343,6 @@ class SimulationSettings(Settings):
         "factor with mean 1 (ours: independent losses would leave a third of the paper's defect-free shots "
         "after one cycle)",
     )
-    uncooled_transport: Annotated[float, Field(ge=1)] = Field(
-        default=3.0,
-        description="transport loss without cooling light, relative to that with it (ours; only "
-        "if lines switch the light)",
-    )
     machine_seed: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
         default=None,
         description="seed of what stays the same from run to run: depths, errors of tones, the camera's "
@@ -424,24 +393,6 @@ class SimulationSettings(Settings):
     )
     mobile_light: MobileLightSettings = Field(
         default=MobileLightSettings(), description="the mobile tweezers' light"
-    )
-    lost_below_depth: Fraction = Field(
-        default=0.1,
-        description="fraction of the nominal depth below which a static tweezer loads no atom, and loses its "
-        "own if it came there without a ramp (ours)",
-    )
-    site_tolerance: float = Field(
-        default=0.25,
-        gt=0,
-        lt=0.5,
-        description="distance, in sites along each axis, within which a mobile tweezer that passes hits an "
-        "atom, and is the same tweezer in the next segment (ours: the waist is 0.22 sites)",
-    )
-    on_amplitude: float = Field(
-        default=1e-3,
-        gt=0,
-        lt=1,
-        description="amplitude, as a fraction of full scale, above which a tone is on (ours)",
     )
     lights: LightSettings = Field(
         default=LightSettings(), description="which lines each kind of light needs; none: it is always on"
@@ -501,15 +452,7 @@ class CameraSettings(camera.CameraSettings):
 
 
 class StaticTweezersSettings(Settings):
-    """The virtual static tweezers."""
-
-    max_depth: PositiveFloat = Field(
-        default=1.5, description="greatest depth, as a fraction of the nominal depth (ours)"
-    )
-    max_amplitude_sum: PositiveFloat = Field(
-        default=1.0,
-        description="greatest sum of the tones' amplitudes on an axis, as a fraction of full scale",
-    )
+    """The virtual static tweezers have no settings; their depth and light are those of the simulation."""
 
 
 class MobileTweezersSettings(Settings):
@@ -518,11 +461,6 @@ class MobileTweezersSettings(Settings):
     band_centre: Frequency = Field(default=100e6, description="middle of the AOD's band (ours)")
     band_half_width: Annotated[Frequency, Field(gt=0)] = Field(
         default=18e6, description="half width of the AOD's band (ours: about 36 MHz in all)"
-    )
-    max_amplitude_sum: PositiveFloat = Field(
-        default=1.0,
-        description="greatest sum of the tones' amplitudes on an axis, as a fraction of full scale, above "
-        "which the output clips",
     )
 
 
@@ -553,4 +491,3 @@ class SpotMeterSettings(Settings):
         default=0.02,
         description="relative s.d. of one measurement of one spot (ours)",
     )
-    duration: Duration = Field(default=20e-3, description="time of a measurement (ours)")

@@ -48,6 +48,8 @@ MIN_LEVEL: Final = 1e-3
 """Depth, relative to the nominal one, below which a static tweezer counts as having this one."""
 NO_RISK: Final = 1e-4
 """Probability of evaporation below which it is left out."""
+UNCOOLED: Final = 3.0
+"""Transport loss without cooling light, relative to that with it (ours)."""
 ROUNDING_S: Final = 1e-6
 """Tolerance for events out of order, in seconds: sums of times are rounded."""
 
@@ -346,8 +348,7 @@ class VirtualSimulation(Simulation):
     def _cooling(self, start_s: float, end_s: float) -> tuple[float, float]:
         """Fraction of the time with cooling light, and the factor on the transport loss: more without it."""
         cooled = self._lights.fraction_on("cooling", start_s, end_s)
-        uncooled = (1.0 - cooled) * self._settings.uncooled_transport
-        return cooled, self._loss_factor * (cooled + uncooled)
+        return cooled, self._loss_factor * (cooled + (1.0 - cooled) * UNCOOLED)
 
     def _begin_event(self, t_s: float, what: str) -> None:
         """Simulate everything before an event; refuse one that comes before the end of another."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,11 @@ from labseq_virtual.responses import lowering
 from labseq_virtual.settings import SimulationSettings
 
 Floats = NDArray[np.float64]
+
+
+HOLDING: Final = 0.1
+"""Depth, as a fraction of the nominal one, below which a static tweezer loads no atom, and loses its own if
+it came there without a ramp (ours)."""
 
 
 class StaticArray:
@@ -55,7 +61,7 @@ class StaticArray:
 
     def holds(self) -> NDArray[np.bool_]:
         """Which sites are deep enough to hold an atom, bool (n_rows, n_cols)."""
-        return self.depth >= self._settings.lost_below_depth
+        return self.depth >= HOLDING
 
     def switch_off(self) -> None:
         """Turn the light off and disconnect the outputs."""

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,10 @@ from labseq_virtual.tone_positions import TonePositions
 from labseq_virtual.tweezer_kernels import CAUSES, LOSSES, N_DRAWS, constants
 
 Floats = NDArray[np.float64]
+
+
+ON: Final = 1e-3
+"""Amplitude, as a fraction of full scale, above which a tone is on (ours)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,11 +141,11 @@ class Transport:
     def _tones(self, program: ToneProgram, index: int) -> NDArray[Any]:
         """The tones of all segments of an axis, (n_tones,); see :class:`labseq_virtual.records.Tone`."""
         axis, full = (program.row, program.column)[index], self._full[index]
-        sites, least = np.arange(len(full)), self._settings.on_amplitude
+        sites = np.arange(len(full))
         start, end = self._positions.actual(index, axis.start_hz), self._positions.actual(index, axis.end_hz)
         tones = np.empty(len(start), TONE)
         tones["start"], tones["end"] = start, end
         tones["power_start"] = (axis.start_amplitude / np.interp(start, sites, full)) ** 2
         tones["power_end"] = (axis.end_amplitude / np.interp(end, sites, full)) ** 2
-        tones["on_start"], tones["on_end"] = axis.start_amplitude > least, axis.end_amplitude > least
+        tones["on_start"], tones["on_end"] = axis.start_amplitude > ON, axis.end_amplitude > ON
         return tones

@@ -53,6 +53,9 @@ Records = Any
 TABLE, VECTOR, OFFSETS = const("float64", 2), const("float64", 1), const("int32", 1)
 TONES = const(signature(TONE), 1)
 
+TOLERANCE = 0.25
+"""Distance, in sites, within which a tweezer that passes hits an atom, and along each axis is the same
+tweezer in the next segment (ours: the waist is 0.22 sites)."""
 MIXING = 0.45
 """Distance of two tones, in sites, below which their tweezers merge (ours)."""
 AT_REST = 1e-6
@@ -120,7 +123,7 @@ def count_held(tweezers: Records) -> int:
 
 
 @helper_kernel()
-def match(before: Records, now: Records, tolerance: float) -> Ints:
+def match(before: Records, now: Records) -> Ints:
     """For each tone the nearest one of the segment before (n_tones,); -1 where none is close enough.
 
     A tone that is the nearest one to several continues as the closest of these, or the first of them.
@@ -132,7 +135,7 @@ def match(before: Records, now: Records, tolerance: float) -> Ints:
             away = abs(now[tone].start - before[other].end)
             if away < least:
                 least = away
-                nearest[tone] = other if away <= tolerance else -1
+                nearest[tone] = other if away <= TOLERANCE else -1
         distance[tone] = least
         for rival in range(tone):
             if nearest[rival] == nearest[tone]:
@@ -141,11 +144,9 @@ def match(before: Records, now: Records, tolerance: float) -> Ints:
 
 
 @helper_kernel()
-def follow(
-    old_row: Records, old_col: Records, old: Records, row: Records, col: Records, tolerance: float
-) -> Records:
+def follow(old_row: Records, old_col: Records, old: Records, row: Records, col: Records) -> Records:
     """Rule 1: tweezers that stay on keep their atoms; other crossings are new or dark."""
-    from_row, from_col = match(old_row, row, tolerance), match(old_col, col, tolerance)
+    from_row, from_col = match(old_row, row), match(old_col, col)
     tweezers = np.zeros((len(row), len(col)), TWEEZER)
     for i in range(len(row)):
         for j in range(len(col)):
@@ -252,15 +253,15 @@ def find_movers(tweezers: Records, min_depth: float) -> Ints:
 
 
 @helper_kernel()
-def span(starts: Floats, ends: Floats, n_sites: int, tolerance: float) -> tuple[int, int]:
+def span(starts: Floats, ends: Floats, n_sites: int) -> tuple[int, int]:
     """Range of the rows or columns that tweezers come close to on their ways: first, last + 1."""
     low, high = min(starts.min(), ends.min()), max(starts.max(), ends.max())
-    first, last = math.floor(low - tolerance), math.ceil(high + tolerance)
+    first, last = math.floor(low - TOLERANCE), math.ceil(high + TOLERANCE)
     return max(first, 0), min(last + 1, n_sites)
 
 
 @helper_kernel()
-def first_to_hit(tweezers: Records, movers: Ints, r: int, c: int, tolerance: float) -> int:
+def first_to_hit(tweezers: Records, movers: Ints, r: int, c: int) -> int:
     """Which tweezer passes over a site first; -1 if none does. One that ends there lands or goes on."""
     first, soonest = -1, math.inf
     for k in movers:
@@ -269,8 +270,8 @@ def first_to_hit(tweezers: Records, movers: Ints, r: int, c: int, tolerance: flo
         to_r, to_c = r - tweezer.row, c - tweezer.col
         when = min(max((to_r * down + to_c * right) / (down * down + right * right), 0.0), 1.0)
         miss_r, miss_c = to_r - when * down, to_c - when * right
-        ends_there = (to_r - down) ** 2 + (to_c - right) ** 2 <= tolerance * tolerance
-        if miss_r * miss_r + miss_c * miss_c <= tolerance * tolerance and when < soonest and not ends_there:
+        ends_there = (to_r - down) ** 2 + (to_c - right) ** 2 <= TOLERANCE * TOLERANCE
+        if miss_r * miss_r + miss_c * miss_c <= TOLERANCE * TOLERANCE and when < soonest and not ends_there:
             first, soonest = k, when
     return first
 
@@ -282,16 +283,15 @@ def sweep(sites: Records, tweezers: Records, constants: Constants, lost: Losses)
     The motion is a straight line from the start to the end of a segment. The first tweezer to arrive
     may lose its own atom too.
     """
-    tolerance = constants.site_tolerance
     movers = find_movers(tweezers, constants.static_depth)
     if len(movers) == 0:
         return
     on_way = tweezers[movers]
-    top, bottom = span(on_way.row, on_way.to_row, sites.shape[0], tolerance)
-    left, right = span(on_way.col, on_way.to_col, sites.shape[1], tolerance)
+    top, bottom = span(on_way.row, on_way.to_row, sites.shape[0])
+    left, right = span(on_way.col, on_way.to_col, sites.shape[1])
     for r in range(top, bottom):
         for c in range(left, right):
-            first = first_to_hit(tweezers, movers, r, c, tolerance) if sites[r, c].atom else -1
+            first = first_to_hit(tweezers, movers, r, c) if sites[r, c].atom else -1
             if first < 0:
                 continue
             sites[r, c].atom = False
@@ -354,7 +354,7 @@ def pass_atoms(sites: Records, tweezers: Records, segment: Segment, constants: C
         for r in range(top, bottom):
             for c in range(left, last):
                 away_m = nearest_pass(r, c, tweezer, constants) if sites[r, c].atom else math.inf
-                if constants.site_tolerance * constants.spacing < away_m < within_m:
+                if TOLERANCE * constants.spacing < away_m < within_m:
                     pass_atom(sites[r, c], tweezer, away_m, speed_m_s, segment.start_s, constants)
 
 
@@ -427,7 +427,7 @@ def set_down(
         r, c, away_m, inside = nearest_site(tweezer.to_row, tweezer.to_col, sites, constants)
         site = sites[r, c]
         if before != HELD:
-            if inside and site.atom and away_m <= constants.site_tolerance * constants.spacing:
+            if inside and site.atom and away_m <= TOLERANCE * constants.spacing:
                 land_empty(site, tweezer, now_s, constants)
             continue
         risk = risks(site.depth, tweezer, away_m, segment.n_further, segment.factor, constants)
@@ -501,7 +501,7 @@ def carry_atoms(
         by_row, by_col = count_lit(row), count_lit(col)
         if by_row.start * by_col.start + by_row.end * by_col.end == 0:  # no tweezer is on
             row, col = row[:0], col[:0]
-        tweezers = follow(old_row, old_col, old, row, col, constants.site_tolerance)
+        tweezers = follow(old_row, old_col, old, row, col)
         lost.program += count_held(old) - count_held(tweezers)
         segment = Segment(now_s, duration_s[k], courses[k], by_row.any + by_col.any - 2, factor)
         n_drawn += play(sites, row, col, tweezers, segment, draws[n_drawn:], constants, merging, lost)

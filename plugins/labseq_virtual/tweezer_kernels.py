@@ -52,7 +52,6 @@ class Constants(NamedTuple):
     tables: NDArray[np.float64]
     spacing: float
     skew: float
-    site_tolerance: float
     static_depth: float
     static_waist: float
     temperature: float
@@ -76,7 +75,6 @@ def constants(grid: SiteGrid, settings: SimulationSettings) -> Constants:
         tables=move_tables(),
         spacing=grid.spacing_m,
         skew=2 * float(a1 @ a2),
-        site_tolerance=settings.site_tolerance,
         static_depth=settings.static_depth,
         static_waist=settings.static_waist,
         temperature=settings.temperature,

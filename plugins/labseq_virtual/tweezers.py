@@ -88,6 +88,10 @@ _NOTHING: Final = np.empty(0)
 _NO_TONES: Final = AxisTones(np.zeros(1, np.int32), _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING)
 SILENCE: Final = ToneProgram(_NO_TONES, _NO_TONES, _NOTHING, np.empty(0, np.int8), np.empty(0, np.int32))
 """The program that has no segments: all tones off."""
+FULL_SCALE: Final = 1.0
+"""Greatest sum of the amplitudes of an axis: above it the output clips."""
+MAX_DEPTH: Final = 1.5
+"""Greatest depth of the static tweezers, as a fraction of the nominal one (ours)."""
 ROUNDING: Final = 1e-9
 """How far a sum of amplitudes may exceed its limit by rounding."""
 
@@ -148,7 +152,7 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
             LimitError: It does.
         """
         band_hz = self._band_hz
-        check_tone_program(self._name, program, band_hz, band_hz, self._settings.max_amplitude_sum)
+        check_tone_program(self._name, program, band_hz, band_hz, FULL_SCALE)
 
     def play(self) -> None:
         """Start playing the prepared program; returns at once.
@@ -279,7 +283,7 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
             LimitError: A depth or duration that the array cannot have.
         """
         self._check_open()
-        check_ramp(self._name, depth, duration_s, self._settings.max_depth)
+        check_ramp(self._name, depth, duration_s, MAX_DEPTH)
         self._play(depth, duration_s)
         self._clock.sleep(duration_s)
 
@@ -335,6 +339,8 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
     def _check(self, amplitudes: Amplitudes) -> None:
         check_amplitudes(self._name, amplitudes, self._grid.shape)
         for axis, values in zip(("row", "column"), amplitudes, strict=True):
-            total, most = float(values.sum()), self._settings.max_amplitude_sum
-            if total > most + ROUNDING:
-                raise LimitError(f"{self._name}: sum of the {axis} amplitudes", f"{total:g}", f"{most:g}")
+            total = float(values.sum())
+            if total > FULL_SCALE + ROUNDING:
+                raise LimitError(
+                    f"{self._name}: sum of the {axis} amplitudes", f"{total:g}", f"{FULL_SCALE:g}"
+                )

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -253,10 +254,14 @@ def test_virtual_hardware_needs_a_simulation() -> None:
 
 
 def test_the_static_tweezers_refuse_calibrated_amplitudes_beyond_a_limit(lab: Lab) -> None:
-    settings = StaticTweezersSettings(max_amplitude_sum=0.5)
-    static = VirtualStaticTweezers(settings, lab.context("static_tweezers"))
+    values = {
+        f"{axis}_amplitudes": np.full(n, 0.6) for axis, n in zip(("row", "column"), GRID.shape, strict=True)
+    }
+    calibrations: Any = {"tweezers": SimpleNamespace(values=values)}
+    context = replace(lab.context("static_tweezers"), calibrations=calibrations)
+    static = VirtualStaticTweezers(StaticTweezersSettings(), context)
     static.open()
-    with pytest.raises(DeviceError, match=r"calibrated amplitudes .* is 1; .* 0\.5"):
+    with pytest.raises(DeviceError, match=r"calibrated amplitudes .* is 1\.2; .* 1"):
         static.self_test()
 
 

@@ -36,7 +36,6 @@ from labseq.model import Batch, Plan, SiteGrid, TargetPattern, TonePaths, TonePr
 from labseq.motion import check_plan, tone_program
 
 from .rf import (
-    FULL_SCALE_V,
     GRID,
     START_S,
     PlayedRfSource,
@@ -299,13 +298,6 @@ def test_a_misplaced_tweezer_is_reported_and_far_ones_move_nothing(axis: int) ->
             assert flights["offset_m"] == pytest.approx([offset_m], rel=0.05)
         else:
             assert len(flights) == 0
-
-
-def test_half_the_volts_on_one_axis_are_a_quarter_of_the_depth() -> None:
-    program = program_of(batch(((5, 2), (5, 4))))
-    light = MobileLightSettings(tone_voltage=FULL_SCALE_V / 20 * 2**0.5)
-    _, flights, _ = fly(program, [(5, 2)], SimulationSettings(transport_loss=0.0, mobile_light=light))
-    assert flights["depth_K"] == pytest.approx([2.1e-3 / 4], rel=0.01)
 
 
 def test_a_temperature_that_the_tweezers_cannot_hold_is_refused() -> None:

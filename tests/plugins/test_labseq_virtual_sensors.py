@@ -121,9 +121,7 @@ def test_both_detectors_work_on_frames_of_a_qcmos_camera() -> None:
 
 @pytest.mark.parametrize("gain", [1.0, 300.0])
 def test_dark_pixels_from_the_table_are_like_pixels_followed_step_by_step(gain: float) -> None:
-    image = ImageSettings(
-        background=1.5, em_gain=gain, read_noise=9.0, electrons_per_adu=3.0, register_clock_induced_charge=0.2
-    )
+    image = ImageSettings(background=1.5, em_gain=gain, read_noise=9.0, electrons_per_adu=3.0)
     camera, rng = Emccd(View.of(image)), np.random.default_rng(4)
     frame = camera.read(np.zeros((512, 512), np.int32), EXPOSURE_S, rng).ravel()
     electrons = camera.register.multiply(rng.poisson(1.505, frame.size), rng)
@@ -172,12 +170,10 @@ def exact(register: Register, n_electrons: int) -> Floats:
 
 
 def stage_by_stage(register: Register, n_electrons: Ints, rng: np.random.Generator) -> Ints:
-    """Every electron in every stage; charge of a stage's own comes behind its multiplication."""
+    """Every electron in every stage."""
     n = n_electrons.copy()
     for _ in range(register.n_stages):
         n += rng.binomial(n, register.p)
-        if register.spurious:
-            n += rng.poisson(register.spurious / register.n_stages, len(n))
     return n
 
 
@@ -235,18 +231,6 @@ def test_no_electron_is_lost_in_the_register(gain: float, n_stages: int) -> None
     out = Register(n_stages, gain).multiply(n, np.random.default_rng(0))
     assert (out >= n).all()
     assert out.sum() <= n.sum() * gain * 1.2 + 1
-
-
-@pytest.mark.parametrize("gain", [1.0, 300.0])
-def test_spurious_charge_of_the_register_is_multiplied_only_by_the_stages_after_it(gain: float) -> None:
-    register, rng = Register(536, gain, spurious=0.5), np.random.default_rng(3)
-    dark = np.zeros(20_000, np.int64)
-    drawn = register.multiply(dark, rng)
-    assert distance(drawn, stage_by_stage(register, dark, rng)) < KOLMOGOROV
-    mean = 0.5 * np.mean((1 + register.p) ** np.arange(536.0))
-    assert drawn.mean() == pytest.approx(mean, rel=0.1)
-    probability = register.output(0.0, power_of_two(60 * gain))
-    assert probability @ np.arange(len(probability)) == pytest.approx(mean, rel=1e-6)
 
 
 @settings(max_examples=30)

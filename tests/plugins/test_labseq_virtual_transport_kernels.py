@@ -17,7 +17,7 @@ from labseq_virtual.handover import merging_distance, pair_survival
 from labseq_virtual.response_kernels import at_once, carry, hand_over, land_on, pass_by
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.transport import Transport
-from labseq_virtual.transport_kernels import AT_REST, MIXING, max_drop_offs, one_left
+from labseq_virtual.transport_kernels import AT_REST, MIXING, TOLERANCE, max_drop_offs, one_left
 from labseq_virtual.tweezer_kernels import EMPTY, HELD, Constants, constants
 from numpy.typing import NDArray
 from scipy.special import ndtr
@@ -138,9 +138,8 @@ class NaiveTransport:
             return dark, dark.copy(), dark.copy(), np.zeros(dark.shape, kernels.TWEEZER)
         pairs = (row, before.row), (col, before.col)
         away: list[Any] = [np.abs(now["start"][:, None] - then["end"]) for now, then in pairs]
-        tolerance = self.settings.site_tolerance
         source: Any = np.ix_(*(each.argmin(axis=1) for each in away))
-        close: Any = np.logical_and.outer(*(_followed(each, tolerance) for each in away))
+        close: Any = np.logical_and.outer(*(_followed(each, TOLERANCE) for each in away))
         old: Any = before.lit, before.loaded, before.fresh
         lit, loaded, fresh = (mask[source] & close for mask in old)
         return lit, loaded, fresh, before.course[source]
@@ -189,7 +188,7 @@ class NaiveTransport:
                 if part >= 1 or (part <= 0 and not (to @ was > 0 or (way.any() and not was.any()))):
                     continue
                 away_m = float(np.linalg.norm(to - max(part, 0.0) * way))
-                if not self.settings.site_tolerance * GRID.spacing_m < away_m < 3.1 * WAIST_M:
+                if not TOLERANCE * GRID.spacing_m < away_m < 3.1 * WAIST_M:
                     continue
                 waited_s = self.now_s - self.thermal[1, r, c]
                 heat = self.moves.relaxed(self.thermal[0, r, c], waited_s)
@@ -218,8 +217,8 @@ class NaiveTransport:
         to_r, to_c = r - row[i]["start"][:, None], c - col[j]["start"][:, None]
         when = np.clip((to_r * down + to_c * right) / (down**2 + right**2), 0.0, 1.0)
         miss = (to_r - when * down) ** 2 + (to_c - when * right) ** 2
-        hit: Any = miss <= self.settings.site_tolerance**2
-        hit &= (to_r - down) ** 2 + (to_c - right) ** 2 > self.settings.site_tolerance**2
+        hit: Any = miss <= TOLERANCE**2
+        hit &= (to_r - down) ** 2 + (to_c - right) ** 2 > TOLERANCE**2
         struck = hit.any(axis=0)
         first = np.unique(np.where(hit, when, np.inf).argmin(axis=0)[struck])
         self.lost["collision"] += count(struck)
@@ -238,7 +237,7 @@ class NaiveTransport:
             r, c, away_m, inside = (each[()] for each in self._nearest(row[i]["end"], col[j]["end"]))
             if not (inside and self.occupied[r, c] and course[i, j].speed > 0):
                 continue
-            if away_m > self.settings.site_tolerance * GRID.spacing_m:
+            if away_m > TOLERANCE * GRID.spacing_m:
                 continue
             peak, speed, fall_s = course[i, j].peak, course[i, j].speed, course[i, j].fall_s
             heat = self.moves.relaxed(self.thermal[0, r, c], now_s - self.thermal[1, r, c])
@@ -335,7 +334,6 @@ PHYSICS = st.fixed_dictionaries(
         "transport_loss_per_tone": st.sampled_from([0.0, 0.05]),
         "temperature": st.sampled_from([1e-6, 60e-6]),
         "pair_survival": st.sampled_from([None, 0.0, 0.4]),
-        "site_tolerance": st.sampled_from([0.25, 0.1, 0.45]),
         "mobile_light": st.fixed_dictionaries(
             {
                 "adiabatic_depth": st.sampled_from([0.0, 1e-3, 3e-3]),

@@ -9,7 +9,7 @@ import labseq
 
 from .small_runs import PROFILE
 
-SIMULATION = "simulation: {use: virtual, loading: 75 %, depth_disorder: 4 %, lost_below_depth: 10 %,"
+SIMULATION = "simulation: {use: virtual, loading: 75 %, depth_disorder: 4 %,"
 SEQUENCE = """
 labseq: 1
 name: ramped
