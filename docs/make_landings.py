@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 from labseq_virtual.flight import KELVIN, STEP_S, draw_atoms
-from labseq_virtual.flight_kernels import N_COLUMNS, energies, follow_atoms
+from labseq_virtual.flight_kernels import energies, follow_atoms, new_flights
 from labseq_virtual.settings import SimulationSettings
 from numpy.typing import NDArray
 
@@ -78,7 +78,7 @@ def follow(path: TweezerPath, rng: np.random.Generator) -> tuple[Floats, Floats]
     plane = np.vstack([np.zeros(2), down, right, np.linalg.inv(np.stack([down, right], axis=1))])
     n_frames = len(path.along_m)
     columns = np.tile(np.arange(float(GROUP)) + path.beside_m / APART_M, (n_frames, 1))
-    alive, record = np.ones(GROUP, np.bool_), np.full((GROUP, N_COLUMNS), np.nan)
+    alive, record = np.ones(GROUP, np.bool_), new_flights(GROUP)
     follow_atoms(
         state, alive, record,
         path.along_m[:, None] / (2 * HALF_M), path.fraction[:, None].copy(), columns, np.ones_like(columns),

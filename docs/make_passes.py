@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from labseq_grid.planner import WEAVE
 from labseq_virtual.flight import KELVIN, STEP_S, draw_atoms
-from labseq_virtual.flight_kernels import N_COLUMNS, energies, follow_atoms
+from labseq_virtual.flight_kernels import energies, follow_atoms, new_flights
 from labseq_virtual.settings import SimulationSettings
 
 from labseq.model import MotionSpec
@@ -63,7 +63,7 @@ def n_taken(
     rows = np.linspace(1.0, -1.0, n_frames + 1)[:, None].copy()
     swing = swing_m * np.cos(2 * math.pi * REACH_M / SPACING_M * rows)
     columns = np.arange(float(GROUP)) + (lane_m + swing) / APART_M
-    alive, record = np.ones(GROUP, np.bool_), np.full((GROUP, N_COLUMNS), np.nan)
+    alive, record = np.ones(GROUP, np.bool_), new_flights(GROUP)
     follow_atoms(
         state, alive, record, rows, np.ones_like(rows), columns, np.ones_like(columns),
         FRAME_S * np.arange(n_frames + 1, dtype=np.float64), depth[None], KELVIN * depth_k,

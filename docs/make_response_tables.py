@@ -24,7 +24,7 @@ from typing import Any, Final
 
 import numpy as np
 from labseq_virtual.flight import KELVIN, RfTransport, draw_atoms
-from labseq_virtual.flight_kernels import GONE, HIGH, VECTOR, energies, move
+from labseq_virtual.flight_kernels import GONE, HIGH, VECTOR, Beams, Site, Spot, energies, move
 from labseq_virtual.responses import AXES, DEPTH_K, SITE_M, START_RAMPS_S, TABLES, TRANSIT_S, WAIST_M
 from labseq_virtual.rf_analysis import HOPS, RfPulse
 from labseq_virtual.settings import SimulationSettings
@@ -104,16 +104,14 @@ def follow_in_row(
         n_steps: Integration steps from frame to frame.
         aside: Distance of the mobile tweezer from the row, along y.
     """
-    site, tweezer = np.zeros(2), np.zeros(9)
-    tweezer[1] = aside
+    widths = Beams(beams[0], beams[1], beams[2], beams[3])
     for i in range(len(state)):
         for k in range(len(static) - 1):
             atom = state[i]
-            site[0] = spacing * round(atom[0] / spacing)
-            tweezer[0], tweezer[2] = place[k], place[k + 1] - place[k]
-            tweezer[4], tweezer[5], tweezer[7] = 1.0, 1.0, mobile[k]
-            tweezer[8] = mobile[k + 1] - mobile[k]
-            move(atom, site, 0.5 * (static[k] + static[k + 1]), tweezer, beams, frame_s, n_steps)
+            site = Site(spacing * round(atom[0] / spacing), 0.0, 0.5 * (static[k] + static[k + 1]))
+            way, brighter = place[k + 1] - place[k], mobile[k + 1] - mobile[k]
+            spot = Spot(place[k], aside, way, 0.0, 1.0, 1.0, 0.0, mobile[k], brighter)
+            move(atom, site, spot, widths, frame_s, n_steps)
             if abs(atom[2]) > 2.0 * HIGH * beams[1] or abs(atom[1]) > 4.0 * GONE * beams[0]:
                 break
 

@@ -233,15 +233,7 @@ class RfTransport:
         off_s: float,
         pairs: float,
     ) -> Counter[str]:
-        from labseq_virtual.flight_kernels import (
-            COLLIDED,
-            DEPTH,
-            HELD_S,
-            LOST_S,
-            N_COLUMNS,
-            OFFSET,
-            follow_atoms,
-        )
+        from labseq_virtual.flight_kernels import follow_atoms, new_flights
 
         rows, row_depth, cols, col_depth = tones
         row, col = np.nonzero(atoms.occupied & self._near(rows, cols) & (depth > 0))
@@ -250,7 +242,7 @@ class RfTransport:
         state = draw_atoms(static[row, col], kt, self._beams[0], self._beams[1], rng)
         state[:, :2] += self._grid.positions_m[row, col]
         alive = np.ones(len(row), np.bool_)
-        record = np.full((len(row), N_COLUMNS), np.nan)
+        record = new_flights(len(row))
         n_steps = math.ceil((t_s[1] - t_s[0]) / STEP_S)
         full = KELVIN * self._light.depth
         luck = rng.spawn(1)[0].random(len(row))
@@ -260,17 +252,17 @@ class RfTransport:
         )  # fmt: skip
         to_row, to_col, energy = self._arrivals(state, static)
         bound = energy < 0
-        held = ~np.isnan(record[:, HELD_S])
+        held = ~np.isnan(record["held_s"])
         flights = np.zeros(len(row), FLIGHTS)
-        flights["held_s"], flights["offset_m"] = record[:, HELD_S], record[:, OFFSET]
-        flights["depth_K"] = record[:, DEPTH] / KELVIN
+        flights["offset_m"], flights["depth_K"] = record["offset"], record["depth"] / KELVIN
+        for name in ("held_s", "lost_s", "lost_row", "lost_col"):
+            flights[name] = record[name]
         flights["from_row"], flights["from_col"] = row, col
         flights["to_row"], flights["to_col"] = to_row, to_col
-        flights["lost_s"], flights["lost_row"], flights["lost_col"] = record[:, LOST_S:COLLIDED].T
         n_tones = max(0, _max_on(rows) + _max_on(cols) - 2)
         loss = self._settings.transport_loss + n_tones * self._settings.transport_loss_per_tone
         unlucky = held & (rng.random(len(row)) < loss * loss_factor)
-        self._assign_fates(flights, alive, record[:, COLLIDED] == 1, bound, unlucky, float(t_s[-1]))
+        self._assign_fates(flights, alive, record["collided"] == 1, bound, unlucky, float(t_s[-1]))
         kept = flights["fate"] == b"kept"
         atoms.occupied[row, col] = False
         atoms.occupied[to_row[kept], to_col[kept]] = True

@@ -1,29 +1,29 @@
 """Kernels that integrate the motion of atoms in the light of static and mobile tweezers.
 
-Energies and depths are per mass, in m^2/s^2. Some arrays stand for several numbers:
+Energies and depths are per mass, in m^2/s^2. Two arrays stand for several numbers:
 
 - ``atom``: position (m) and velocity (m/s), (6,).
 - ``plane``: position of site (0, 0), step from row to row, step from column to column, in m; then
   the inverse of the steps, so that ``plane[3:] @ (x, y)`` is in sites (5, 2).
-- ``beams``: waist and Rayleigh length of the static tweezers, then of the mobile ones (4,).
-- ``tweezer``: position of a mobile tweezer, its displacement until the next frame, its depth, and the
-  depth factors of its row and column tones, each with its change until then (9,).
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import const, helper_kernel, kernel
+from labseq_virtual.records import record, signature
 
 Floats = NDArray[np.float64]
+Records = Any
+"""An array of records: numpy has no type for one that knows its columns."""
 
 TABLE = const("float64", 2)
 VECTOR = const("float64", 1)
-OUTPUT = "float64[::1]"
 
 NEAR = 3.5
 """Distance in waists beyond which a tweezer is neglected: there it has 2e-11 of its depth."""
@@ -32,14 +32,81 @@ GONE = 2.0
 HIGH = 4.0
 """Distance from the plane in Rayleigh lengths beyond which an unbound atom counts as lost (ours)."""
 
-HELD_S, OFFSET, DEPTH, LOST_S, LOST_ROW, LOST_COL, COLLIDED = range(7)
-"""Columns of an atom's record: when a mobile tweezer first held it, and how far that tweezer was from the
-nearest site; the tweezer's greatest depth; when and where (in sites) the atom was lost; whether it
-collided."""
-N_COLUMNS = 7
+
+class Beams(NamedTuple):
+    """Waists and Rayleigh lengths of the static tweezers and of the mobile ones."""
+
+    static_waist: float
+    static_rayleigh: float
+    mobile_waist: float
+    mobile_rayleigh: float
 
 
-@helper_kernel("UniTuple(float64, 4)(float64, float64, float64, float64, float64, float64)")
+class Site(NamedTuple):
+    """The site nearest to an atom: its place in metres, and its depth."""
+
+    x: float
+    y: float
+    depth: float
+
+
+class Spot(NamedTuple):
+    """A mobile tweezer from one frame to the next, in which all changes linearly.
+
+    Attributes:
+        x: Its place at the first frame.
+        y: Likewise.
+        way_x: Its displacement until the next one.
+        way_y: Likewise.
+        depth: Its depth if both tones have their intended power.
+        row: Depth factor of its row tone.
+        row_change: Its change until the next frame.
+        col: Depth factor of its column tone.
+        col_change: Its change.
+    """
+
+    x: float
+    y: float
+    way_x: float
+    way_y: float
+    depth: float
+    row: float
+    row_change: float
+    col: float
+    col_change: float
+
+
+class Flight:
+    """What is recorded of an atom; nan where it did not happen.
+
+    Attributes:
+        held_s: When a mobile tweezer first held it.
+        offset: How far that tweezer was from the nearest site, in metres.
+        depth: Greatest depth of the tweezer.
+        lost_s: When the atom was lost.
+        lost_row: Where, in sites.
+        lost_col: Likewise.
+        collided: Whether it collided, 1 or 0.
+    """
+
+    held_s: float
+    offset: float
+    depth: float
+    lost_s: float
+    lost_row: float
+    lost_col: float
+    collided: float
+
+
+FLIGHT: Final = record(Flight)
+
+
+def new_flights(n_atoms: int) -> Records:
+    """Records of atoms of which nothing has happened yet (n_atoms,)."""
+    return np.full((n_atoms, len(FLIGHT.names or ())), np.nan).view(FLIGHT)[:, 0]
+
+
+@helper_kernel()
 def pull(
     x: float, y: float, z: float, depth: float, waist: float, rayleigh: float
 ) -> tuple[float, float, float, float]:
@@ -75,19 +142,33 @@ def energies(state: Floats, sites: Floats, depth: Floats, waist: float, rayleigh
     return found
 
 
-@helper_kernel(f"Tuple((int64, float64))({TABLE}, int64, float64)")
-def nearest(tracks: Floats, k: int, place: float) -> tuple[int, float]:
-    """The tone nearest to a place, in sites, that is on at frame k or the next, and its distance."""
+@helper_kernel()
+def sites_of(x: float, y: float, plane: Floats) -> tuple[float, float]:
+    """Row and column of a place, in sites."""
+    x, y = x - plane[0, 0], y - plane[0, 1]
+    return plane[3, 0] * x + plane[3, 1] * y, plane[4, 0] * x + plane[4, 1] * y
+
+
+@helper_kernel()
+def place_of(row: float, col: float, plane: Floats) -> tuple[float, float]:
+    """Place of a row and column, in metres."""
+    x = plane[0, 0] + row * plane[1, 0] + col * plane[2, 0]
+    return x, plane[0, 1] + row * plane[1, 1] + col * plane[2, 1]
+
+
+@helper_kernel()
+def nearest(tracks: Floats, k: int, place: float) -> int:
+    """The tone nearest to a place, in sites, that is on at frame k or the next; -1 if none is."""
     best, least = -1, np.inf
     for j in range(tracks.shape[1]):
         for frame in (k, k + 1):
             away = abs(tracks[frame, j] - place)
             if away < least:  # never for nan
                 best, least = j, away
-    return best, least
+    return best
 
 
-@kernel(f"UniTuple(float64, 4)({TABLE}, {TABLE}, int64, int64)")
+@helper_kernel()
 def course(tracks: Floats, depth: Floats, k: int, j: int) -> tuple[float, float, float, float]:
     """Place of a tone at frame k and its depth factor, and how they change until the next frame.
 
@@ -102,43 +183,30 @@ def course(tracks: Floats, depth: Floats, k: int, j: int) -> tuple[float, float,
     return here, there - here, first, last - first
 
 
-@helper_kernel(
-    f"boolean({VECTOR}, {TABLE}, {TABLE}, {TABLE}, {TABLE}, int64, {TABLE}, float64, float64, {OUTPUT})"
-)
-def find_tweezer(
-    atom: Floats,
-    rows: Floats,
-    row_depth: Floats,
-    cols: Floats,
-    col_depth: Floats,
-    k: int,
-    plane: Floats,
-    reach: float,
-    depth: float,
-    tweezer: Floats,
-) -> bool:
-    """Find the mobile tweezer nearest to an atom; whether it comes within ``reach`` until the next frame."""
-    x, y = atom[0] - plane[0, 0], atom[1] - plane[0, 1]
-    i, _ = nearest(rows, k, plane[3, 0] * x + plane[3, 1] * y)
-    j, _ = nearest(cols, k, plane[4, 0] * x + plane[4, 1] * y)
-    tweezer[:] = 0.0
+@helper_kernel()
+def find_spot(
+    atom: Floats, rows: Floats, row_depth: Floats, cols: Floats, col_depth: Floats, k: int, plane: Floats,
+    reach: float, depth: float,
+) -> Spot:  # fmt: skip
+    """The mobile tweezer nearest to an atom; of depth 0 if it stays beyond ``reach`` until the next frame."""
+    dark = Spot(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    row, col = sites_of(atom[0], atom[1], plane)
+    i, j = nearest(rows, k, row), nearest(cols, k, col)
     if i < 0 or j < 0:
-        return False
-    row, down, tweezer[5], tweezer[6] = course(rows, row_depth, k, i)
-    col, right, tweezer[7], tweezer[8] = course(cols, col_depth, k, j)
-    for axis in range(2):
-        tweezer[axis] = plane[0, axis] + row * plane[1, axis] + col * plane[2, axis]
-        tweezer[2 + axis] = down * plane[1, axis] + right * plane[2, axis]
-    tweezer[4] = depth
-    x, y = atom[0] - tweezer[0], atom[1] - tweezer[1]
-    return min(math.hypot(x, y), math.hypot(x - tweezer[2], y - tweezer[3])) < reach
+        return dark
+    row, down, row_factor, row_change = course(rows, row_depth, k, i)
+    col, right, col_factor, col_change = course(cols, col_depth, k, j)
+    x, y = place_of(row, col, plane)
+    way_x, way_y = down * plane[1, 0] + right * plane[2, 0], down * plane[1, 1] + right * plane[2, 1]
+    to_x, to_y = atom[0] - x, atom[1] - y
+    if min(math.hypot(to_x, to_y), math.hypot(to_x - way_x, to_y - way_y)) >= reach:
+        return dark
+    return Spot(x, y, way_x, way_y, depth, row_factor, row_change, col_factor, col_change)
 
 
-@helper_kernel(f"void({OUTPUT}, {VECTOR}, float64, {VECTOR}, {VECTOR}, float64, int64)")
-def move(
-    atom: Floats, site: Floats, depth: float, tweezer: Floats, beams: Floats, duration: float, n_steps: int
-) -> None:
-    """Move an atom for a while, in a static tweezer at ``site`` and a mobile one: leapfrog."""
+@helper_kernel()
+def move(atom: Floats, site: Site, spot: Spot, beams: Beams, duration: float, n_steps: int) -> None:
+    """Move an atom from one frame to the next, in a static tweezer and a mobile one: leapfrog."""
     x, y, z, vx, vy, vz = atom
     dt = duration / n_steps
     for step in range(n_steps):
@@ -146,11 +214,11 @@ def move(
         y += 0.5 * dt * vy
         z += 0.5 * dt * vz
         part = (step + 0.5) / n_steps
-        ax, ay, az, _ = pull(x - site[0], y - site[1], z, depth, beams[0], beams[1])
-        mobile = tweezer[4] * (tweezer[5] + part * tweezer[6]) * (tweezer[7] + part * tweezer[8])
+        ax, ay, az, _ = pull(x - site.x, y - site.y, z, site.depth, beams.static_waist, beams.static_rayleigh)
+        mobile = spot.depth * (spot.row + part * spot.row_change) * (spot.col + part * spot.col_change)
         if mobile > 0.0:
-            away_x, away_y = x - tweezer[0] - part * tweezer[2], y - tweezer[1] - part * tweezer[3]
-            bx, by, bz, _ = pull(away_x, away_y, z, mobile, beams[2], beams[3])
+            away_x, away_y = x - spot.x - part * spot.way_x, y - spot.y - part * spot.way_y
+            bx, by, bz, _ = pull(away_x, away_y, z, mobile, beams.mobile_waist, beams.mobile_rayleigh)
             ax, ay, az = ax + bx, ay + by, az + bz
         vx += dt * ax
         vy += dt * ay
@@ -161,66 +229,82 @@ def move(
     atom[0], atom[1], atom[2], atom[3], atom[4], atom[5] = x, y, z, vx, vy, vz
 
 
-@helper_kernel(
-    f"Tuple((boolean, float64))({VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR}, {OUTPUT}, float64)"
-)
+@helper_kernel()
 def check_bound(
-    atom: Floats, site: Floats, depth: float, tweezer: Floats, beams: Floats, record: Floats, t_s: float
+    atom: Floats, site: Site, spot: Spot, beams: Beams, flight: Flight, t_s: float
 ) -> tuple[bool, float]:
     """Whether an atom is still trapped at the end of a frame, and its energy; records when it is held.
 
     An unbound atom is lost once it is far from every tweezer or far from the plane.
     """
-    x, y, z = atom[0] - site[0], atom[1] - site[1], atom[2]
+    x, y, z = atom[0] - site.x, atom[1] - site.y, atom[2]
     from_site = math.hypot(x, y)
-    energy = pull(x, y, z, depth, beams[0], beams[1])[3]
+    energy = pull(x, y, z, site.depth, beams.static_waist, beams.static_rayleigh)[3]
     energy += 0.5 * (atom[3] ** 2 + atom[4] ** 2 + atom[5] ** 2)
-    mobile = tweezer[4] * (tweezer[5] + tweezer[6]) * (tweezer[7] + tweezer[8])
-    if mobile <= 0.0:
-        near = from_site < GONE * beams[0]
-    else:
-        x, y = atom[0] - tweezer[0] - tweezer[2], atom[1] - tweezer[1] - tweezer[3]
-        energy += pull(x, y, z, mobile, beams[2], beams[3])[3]
-        from_tweezer = math.hypot(x, y)
-        near = from_site < GONE * beams[0] or from_tweezer < GONE * beams[2]
-        if mobile > depth and from_tweezer < beams[2]:
-            if math.isnan(record[HELD_S]):
-                record[HELD_S], record[DEPTH] = t_s, 0.0
-                x, y = tweezer[0] + tweezer[2] - site[0], tweezer[1] + tweezer[3] - site[1]
-                record[OFFSET] = math.hypot(x, y)
-            record[DEPTH] = max(record[DEPTH], mobile)
-    return energy < 0.0 or (near and abs(z) < HIGH * beams[3]), energy
+    near = from_site < GONE * beams.static_waist
+    mobile = spot.depth * (spot.row + spot.row_change) * (spot.col + spot.col_change)
+    if mobile > 0.0:
+        x, y = atom[0] - spot.x - spot.way_x, atom[1] - spot.y - spot.way_y
+        energy += pull(x, y, z, mobile, beams.mobile_waist, beams.mobile_rayleigh)[3]
+        from_spot = math.hypot(x, y)
+        near = near or from_spot < GONE * beams.mobile_waist
+        if mobile > site.depth and from_spot < beams.mobile_waist:
+            record_hold(site, spot, mobile, flight, t_s)
+    return energy < 0.0 or (near and abs(z) < HIGH * beams.mobile_rayleigh), energy
 
 
-@helper_kernel(f"void({VECTOR}, {TABLE}, {OUTPUT}, float64, float64)")
-def record_loss(atom: Floats, plane: Floats, record: Floats, t_s: float, collided: float) -> None:
+@helper_kernel()
+def record_hold(site: Site, spot: Spot, depth: float, flight: Flight, t_s: float) -> None:
+    """Record that a mobile tweezer holds an atom."""
+    if math.isnan(flight.held_s):
+        flight.held_s, flight.depth = t_s, 0.0
+        flight.offset = math.hypot(spot.x + spot.way_x - site.x, spot.y + spot.way_y - site.y)
+    flight.depth = max(flight.depth, depth)
+
+
+@helper_kernel()
+def record_loss(atom: Floats, plane: Floats, flight: Flight, t_s: float, collided: float) -> None:
     """Record when and where an atom was lost, and whether in a collision."""
-    x, y = atom[0] - plane[0, 0], atom[1] - plane[0, 1]
-    record[LOST_S], record[COLLIDED] = t_s, collided
-    record[LOST_ROW] = plane[3, 0] * x + plane[3, 1] * y
-    record[LOST_COL] = plane[4, 0] * x + plane[4, 1] * y
+    flight.lost_s, flight.collided = t_s, collided
+    flight.lost_row, flight.lost_col = sites_of(atom[0], atom[1], plane)
 
 
-@helper_kernel(f"float64({VECTOR}, {TABLE}, {TABLE}, {OUTPUT})")
-def find_site(atom: Floats, plane: Floats, static_depth: Floats, site: Floats) -> float:
-    """Find the site nearest to an atom: its position, row and column; returns its depth."""
-    x, y = atom[0] - plane[0, 0], atom[1] - plane[0, 1]
-    row = min(max(round(plane[3, 0] * x + plane[3, 1] * y), 0), static_depth.shape[0] - 1)
-    col = min(max(round(plane[4, 0] * x + plane[4, 1] * y), 0), static_depth.shape[1] - 1)
-    for axis in range(2):
-        site[axis] = plane[0, axis] + row * plane[1, axis] + col * plane[2, axis]
-    site[2], site[3] = row, col
-    return float(static_depth[row, col])
+@helper_kernel()
+def find_site(atom: Floats, plane: Floats, static_depth: Floats) -> Site:
+    """The site nearest to an atom."""
+    at_row, at_col = sites_of(atom[0], atom[1], plane)
+    row = min(max(round(at_row), 0), static_depth.shape[0] - 1)
+    col = min(max(round(at_col), 0), static_depth.shape[1] - 1)
+    x, y = place_of(row, col, plane)
+    return Site(x, y, static_depth[row, col])
+
+
+@helper_kernel()
+def collide(
+    state: Floats, alive: NDArray[np.bool_], moving: NDArray[np.bool_], flights: Records, plane: Floats,
+    within: float, luck: Floats, pair_survival: float, t_s: float,
+) -> None:  # fmt: skip
+    """Of two moving atoms that are closer than ``within``, collisions in the light leave one or none."""
+    for i in range(len(alive)):
+        for j in range(i):
+            if not (moving[i] and moving[j] and alive[i] and alive[j]):
+                continue
+            if math.hypot(state[i, 0] - state[j, 0], state[i, 1] - state[j, 1]) < within:
+                one_left = luck[i] < pair_survival
+                alive[i], alive[j] = one_left and luck[j] < 0.5, one_left and luck[j] >= 0.5
+                for atom in (i, j):
+                    if not alive[atom]:
+                        record_loss(state[atom], plane, flights[atom], t_s, 1.0)
 
 
 @kernel(
-    f"void(float64[:, ::1], boolean[::1], float64[:, ::1], {TABLE}, {TABLE}, {TABLE}, {TABLE}, {VECTOR}, "
-    f"{TABLE}, float64, {TABLE}, {VECTOR}, int64, {VECTOR}, float64)"
+    f"void(float64[:, ::1], boolean[::1], Array({signature(FLIGHT)}, 1, 'C'), {TABLE}, {TABLE}, {TABLE}, "
+    f"{TABLE}, {VECTOR}, {TABLE}, float64, {TABLE}, {VECTOR}, int64, {VECTOR}, float64)"
 )
 def follow_atoms(
     state: Floats,
     alive: NDArray[np.bool_],
-    record: Floats,
+    flights: Records,
     rows: Floats,
     row_depth: Floats,
     cols: Floats,
@@ -229,7 +313,7 @@ def follow_atoms(
     static_depth: Floats,
     mobile_depth: float,
     plane: Floats,
-    beams: Floats,
+    widths: Floats,
     n_steps: int,
     luck: Floats,
     pair_survival: float,
@@ -243,7 +327,7 @@ def follow_atoms(
     Args:
         state: The atoms, (n_atoms, 6); changed in place.
         alive: Which atoms are still trapped, (n_atoms,); changed in place.
-        record: A record of each atom, (n_atoms, N_COLUMNS), nan at the start; changed in place.
+        flights: A record of each atom, see :func:`new_flights`; changed in place.
         rows: Row tones, in sites (n_frames, n_tracks), nan where off.
         row_depth: Their depth factors, likewise.
         cols: Column tones, likewise.
@@ -252,41 +336,30 @@ def follow_atoms(
         static_depth: Depths of the static tweezers (n_rows, n_cols).
         mobile_depth: Depth of a mobile tweezer whose factors are 1.
         plane: The plane of the sites.
-        beams: The beams.
+        widths: The numbers of :class:`Beams` (4,).
         n_steps: Integration steps from frame to frame.
         luck: A uniform random number for each atom (n_atoms,).
         pair_survival: Probability that one of two atoms is left.
     """
-    site, tweezer = np.empty(4), np.empty(9)
+    beams = Beams(widths[0], widths[1], widths[2], widths[3])
     moving = np.zeros(len(alive), np.bool_)
     for k in range(len(t_s) - 1):
         for i in range(len(alive)):
             moving[i] = False
             if not alive[i]:
                 continue
-            atom = state[i]
-            depth = find_site(atom, plane, static_depth, site)
-            near = find_tweezer(
-                atom, rows, row_depth, cols, col_depth, k, plane, NEAR * beams[2], mobile_depth, tweezer
+            atom, flight = state[i], flights[i]
+            site = find_site(atom, plane, static_depth)
+            spot = find_spot(
+                atom, rows, row_depth, cols, col_depth, k, plane, NEAR * beams.mobile_waist, mobile_depth
             )
-            if not near:
-                tweezer[4] = 0.0
-                there, energy = check_bound(atom, site, depth, tweezer, beams, record[i], t_s[k])
+            if spot.depth == 0.0:
+                there, energy = check_bound(atom, site, spot, beams, flight, t_s[k])
                 if there and energy < 0.0:
                     continue
             moving[i] = True
-            move(atom, site, depth, tweezer, beams, t_s[k + 1] - t_s[k], n_steps)
-            alive[i], _ = check_bound(atom, site, depth, tweezer, beams, record[i], t_s[k + 1])
+            move(atom, site, spot, beams, t_s[k + 1] - t_s[k], n_steps)
+            alive[i], _ = check_bound(atom, site, spot, beams, flight, t_s[k + 1])
             if not alive[i]:
-                record_loss(atom, plane, record[i], t_s[k + 1], 0.0)
-        for i in range(len(alive)):
-            for j in range(i):
-                if not (moving[i] and moving[j] and alive[i] and alive[j]):
-                    continue
-                if math.hypot(state[i, 0] - state[j, 0], state[i, 1] - state[j, 1]) < beams[2]:
-                    one_left = luck[i] < pair_survival
-                    alive[i], alive[j] = one_left and luck[j] < 0.5, one_left and luck[j] >= 0.5
-                    if not alive[i]:
-                        record_loss(state[i], plane, record[i], t_s[k + 1], 1.0)
-                    if not alive[j]:
-                        record_loss(state[j], plane, record[j], t_s[k + 1], 1.0)
+                record_loss(atom, plane, flight, t_s[k + 1], 0.0)
+        collide(state, alive, moving, flights, plane, beams.mobile_waist, luck, pair_survival, t_s[k + 1])

@@ -15,15 +15,13 @@ from hypothesis.extra.numpy import arrays
 from labseq_virtual.atoms import Atoms
 from labseq_virtual.flight import KELVIN, RfTransport, draw_atoms
 from labseq_virtual.flight_kernels import (
-    COLLIDED,
-    DEPTH,
-    HELD_S,
-    LOST_S,
-    N_COLUMNS,
-    OFFSET,
+    Beams,
+    Site,
+    Spot,
     energies,
     follow_atoms,
     move,
+    new_flights,
     pull,
 )
 from labseq_virtual.rf_analysis import PulseReceiver, RfPulse
@@ -66,9 +64,9 @@ class Light:
         self.depth = np.array(depth, np.float64)[:, None]
         self.t_s: Floats = np.arange(len(row), dtype=np.float64) * HOP_S
 
-    def act(self, state: Floats, n_steps: int = 25, pairs: float = 0.0) -> tuple[NDArray[np.bool_], Floats]:
+    def act(self, state: Floats, n_steps: int = 25, pairs: float = 0.0) -> tuple[NDArray[np.bool_], Any]:
         """Move atoms; returns who is alive and the record."""
-        alive, record = np.ones(len(state), np.bool_), np.full((len(state), N_COLUMNS), np.nan)
+        alive, record = np.ones(len(state), np.bool_), new_flights(len(state))
         follow_atoms(
             state, alive, record, self.rows, np.ones_like(self.rows), self.cols, self.depth, self.t_s,
             np.full(GRID.shape, STATIC), MOBILE, plane(), BEAMS, n_steps, np.full(len(state), 0.3), pairs,
@@ -121,8 +119,7 @@ def test_the_trap_frequencies_are_the_papers() -> None:
 def test_moving_agrees_with_an_adaptive_integrator(seed: int) -> None:
     rng = np.random.default_rng(seed)
     atom = np.concatenate([rng.normal(0, 0.15e-6, 2), rng.normal(0, 0.5e-6, 1), rng.normal(0, 0.05, 3)])
-    site = np.zeros(4)
-    tweezer = np.array([0.1e-6, -0.05e-6, 0.3e-6, 0.1e-6, MOBILE, 0.2, 0.6, 1.0, -0.2])
+    site, spot = Site(0.0, 0.0, STATIC), Spot(0.1e-6, -0.05e-6, 0.3e-6, 0.1e-6, MOBILE, 0.2, 0.6, 1.0, -0.2)
     duration = 4e-6
 
     def slope(t: float, y: Floats) -> Floats:
@@ -134,7 +131,7 @@ def test_moving_agrees_with_an_adaptive_integrator(seed: int) -> None:
         return np.array([*y[3:], *(static[i] + mobile[i] for i in range(3))])
 
     expected = solve_ivp(slope, (0, duration), atom, rtol=1e-9, atol=1e-15).y[:, -1]
-    move(atom, site, STATIC, tweezer, BEAMS, duration, 160)
+    move(atom, site, spot, Beams(*BEAMS), duration, 160)
     assert atom[:3] == pytest.approx(expected[:3], abs=1e-9)
     assert atom[3:] == pytest.approx(expected[3:], abs=1e-3)
 
@@ -144,9 +141,9 @@ def test_an_atom_is_carried_and_set_down() -> None:
     alive, record = carriage(4).act(state)
     assert alive[0]
     assert np.hypot(*(state[0, :2] - GRID.positions_m[5, 7])) < 0.3e-6
-    assert 0 < record[0, HELD_S] < 60e-6
-    assert record[0, OFFSET] == pytest.approx(0, abs=1e-12)
-    assert record[0, DEPTH] == pytest.approx(MOBILE)
+    assert 0 < record[0].held_s < 60e-6
+    assert record[0].offset == pytest.approx(0, abs=1e-12)
+    assert record[0].depth == pytest.approx(MOBILE)
 
 
 def test_a_shallow_tweezer_leaves_the_atom_behind_and_a_distant_one_does_too() -> None:
@@ -167,8 +164,8 @@ def test_of_two_atoms_in_one_tweezer_collisions_leave_one_or_none(pairs: float, 
     alive, record = carriage(3).act(state, pairs=pairs)
     assert alive[:2].sum() == left
     assert alive[2]
-    assert (record[~alive, COLLIDED] == 1).all()
-    assert (record[~alive, LOST_S] > 60e-6).all()
+    assert (record["collided"][~alive] == 1).all()
+    assert (record["lost_s"][~alive] > 60e-6).all()
 
 
 def test_an_atom_in_flight_is_lost_when_nothing_catches_it() -> None:
@@ -176,7 +173,7 @@ def test_an_atom_in_flight_is_lost_when_nothing_catches_it() -> None:
     state[0, 3] = 1.0
     alive, record = carriage(3).act(state)
     assert not alive[0]
-    assert record[0, LOST_S] < 10e-6
+    assert record[0].lost_s < 10e-6
 
 
 SURE = SimulationSettings(transport_loss=0.0, pair_survival=0.0)
