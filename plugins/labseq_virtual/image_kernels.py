@@ -19,7 +19,7 @@ START_BITS = 12
 _SHIFT = 32 - START_BITS
 
 
-@helper_kernel(f"int64(uint32, {WORDS}, {STARTS})")
+@helper_kernel()
 def place(word: np.uint32, edges: NDArray[np.uint32], starts: NDArray[np.int32]) -> int:
     """Index of the first edge of a table that is not below a word."""
     j = int(starts[word >> _SHIFT])

@@ -20,7 +20,7 @@ YOUNG = 8
 """A track with fewer frames than this gives way to an older one."""
 
 
-@helper_kernel(f"int64({POWER}, int64, float64, int64, int64[::1])")
+@helper_kernel()
 def find_peaks(power: NDArray[np.float32], k: int, threshold: float, reach: int, found: Ints) -> int:
     """Find the peaks of spectrum k, each the greatest within ``reach`` bins, rising; returns how many."""
     n = 0
