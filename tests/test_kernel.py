@@ -181,6 +181,33 @@ def test_constants_of_other_modules_and_in_tuples_and_functions_of_numba_belong_
     assert results == [2.5, 6.5, 6.5000000001, 21.5]
 
 
+def test_the_columns_of_records_and_named_tuples_belong_to_the_source(package: Package) -> None:
+    top = """
+        import numpy as np
+        from labseq.kernels.kernel import kernel
+        from {package}.columns import RECORD, Pair
+
+        @kernel("int64(UniTuple(int64, 2))")
+        def top(numbers):
+            pair, records = Pair(*numbers), np.zeros(2, RECORD)
+            records[0].a = pair.first
+            return records[0].a + 10 * records.itemsize
+    """
+    columns = """
+        import numpy as np
+        from typing import Any, NamedTuple
+        RECORD = np.dtype([(name, np.int64) for name in {record}])
+        Pair = NamedTuple("Pair", {pair})
+    """
+    package.write("top", top.format(package=package.name))
+    results = []
+    for record, pair in (("ab", "first second"), ("ab", "second first"), ("abc", "second first")):
+        fields = [(name, "Any") for name in pair.split()]
+        package.write("columns", columns.format(record=list(record), pair=fields))
+        results.append(package.load().top((1, 2)))
+    assert results == [161, 162, 242]
+
+
 def test_the_values_of_an_enclosing_function_belong_to_the_source(cache: Path) -> None:
     def adding(step: int) -> Any:
         @kernel("int64(int64)")

@@ -392,6 +392,10 @@ def _constant(name: str, value: object) -> str:
         return repr((name, type(value).__name__, value))
     if isinstance(value, type) and hasattr(value, "__members__"):  # an enumeration
         return repr((name, list(cast("Any", value))))
+    if isinstance(value, np.dtype):  # of records: names and places of the columns
+        return repr((name, dict(cast("Any", value).fields or {})))
+    if isinstance(value, type) and hasattr(value, "_fields"):  # a named tuple
+        return repr((name, cast("Any", value)._fields))
     return ""
 
 
