@@ -287,8 +287,8 @@ def sweep(sites: Records, tweezers: Records, constants: Constants, lost: Losses)
     if len(movers) == 0:
         return
     on_way = tweezers[movers]
-    top, bottom = span(on_way.row, on_way.to_row, sites.shape[0])
-    left, right = span(on_way.col, on_way.to_col, sites.shape[1])
+    top, bottom = span(on_way["row"], on_way["to_row"], sites.shape[0])
+    left, right = span(on_way["col"], on_way["to_col"], sites.shape[1])
     for r in range(top, bottom):
         for c in range(left, right):
             first = first_to_hit(tweezers, movers, r, c) if sites[r, c].atom else -1
