@@ -115,9 +115,7 @@ def registry() -> Registry:
 def settings(kind: str, *names: str) -> list[Block]:
     """The keys of a file, of a part of it, or of a plugin; "top" leaves out those of its parts."""
     if kind in ROLES:
-        entry = registry().find(kind, *names)
-        assert entry is not None, names
-        return [reference.settings(entry.settings_model)]
+        return [reference.settings(registry().get(kind, *names).settings_model)]
     keys = [name for name in names if name != "top"]
     return [file_settings(kind, *keys, top="top" in names)]
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.errors import PluginLoadError
+from labseq.errors import PluginLoadError, UnknownPluginError
 from labseq.roles.table import ROLES, Role
 
 VIRTUAL_TWIN: Final = "virtual"
@@ -271,6 +271,18 @@ class Registry:
         self._entries[kind, name] = entry
         return entry
 
+    def get(self, kind: str, name: str) -> Entry:
+        """Find an entry, for a plugin that builds on another one.
+
+        Raises:
+            UnknownPluginError: There is no such entry.
+            PluginLoadError: It cannot be imported.
+        """
+        entry = self.find(kind, name)
+        if entry is None:
+            raise UnknownPluginError(kind, name, self.names(kind))
+        return entry
+
     def names(self, kind: str) -> list[str]:
         """Names of all entries of a kind, sorted."""
         return sorted(name for k, name in self._entries if k == kind)
@@ -283,7 +295,7 @@ class Registry:
 
     def entries(self, origin: str | None = None) -> list[Entry]:
         """All entries, or those of one plugin, by kind and name."""
-        return [entry for key in self.offers(origin) if (entry := self.find(*key)) is not None]
+        return [self.get(*key) for key in self.offers(origin)]
 
 
 def _import_place(value: Any) -> Any:

@@ -145,8 +145,8 @@ def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, problem
     """Find lines that are on during unknown steps."""
     if spec.lines is None:
         return
-    entries = [host.registry.find("step", name) for name in host.registry.names("step")]
-    steps = [entry.name for entry in entries if entry and getattr(entry.factory, "takes_time", True)]
+    entries = [host.registry.get("step", name) for name in host.registry.names("step")]
+    steps = [entry.name for entry in entries if getattr(entry.factory, "takes_time", True)]
     known = [IDLE, *steps]
     for name, channel in spec.lines.channels.items():
         for place, kind in enumerate(channel.on):

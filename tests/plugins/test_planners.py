@@ -149,8 +149,7 @@ def test_all_are_registered_and_can_be_warmed() -> None:
         plugin.labseq_register(registry)
     assert {*registry.names("planner")} == {*PLANNERS}
     for name in PLANNERS:
-        entry = registry.find("planner", name)
-        assert entry is not None
+        entry = registry.get("planner", name)
         planner = entry.factory(entry.settings_model and entry.settings_model(), Context())
         assert isinstance(planner, NeedsWarmUp)
         planner.warm()
