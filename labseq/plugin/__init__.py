@@ -4,6 +4,7 @@ What only some plugins need is in modules by subject:
 
 - ``camera``: base class of camera drivers, their settings, cooling, a simulated sensor
 - ``geometry``: sites of a grid: blocks, patterns, their order from the centre
+- ``leader``: settings, log and simulation of another control system that starts the shots
 - ``lines``: programs of a timing box, and the line that triggers a device
 - ``messages``: wording of error messages
 - ``motion``: from a plan to tones, and to the samples of an AWG

@@ -15,10 +15,11 @@ from labseq.plugin import (
     format_quantity,
     wait_for,
 )
+from labseq.plugin.leader import GO, check_signal, load_atoms
 from labseq.plugin.messages import one_of
-from labseq_follow.links import Event, Link, SerialLink, SimulatedLink, TcpLink, load_atoms
-from labseq_follow.protocol import GO, VERSION, About, Dialogue, Splitter, encoded
-from labseq_follow.settings import SIMULATED, LeaderSettings, SerialLeaderSettings, TcpLeaderSettings
+from labseq_follow.links import Event, Link, SerialLink, SimulatedLink, TcpLink
+from labseq_follow.protocol import VERSION, About, Dialogue, Splitter, encoded
+from labseq_follow.settings import SIMULATED, LinkSettings, SerialLeaderSettings, TcpLeaderSettings
 
 LOADING_S: Final = 0.25
 """How long atoms load in a simulated lab with a real control system: five times the simulation's own time."""
@@ -50,7 +51,7 @@ class LeaderDevice(Device):
         ConfigError: The settings load atoms, but no lab is simulated.
     """
 
-    def __init__(self, settings: LeaderSettings, context: Context, link: Link) -> None:
+    def __init__(self, settings: LinkSettings, context: Context, link: Link) -> None:
         if settings.loads and context.simulation is None:
             raise ConfigError("'loads' is for a simulated lab, and this one is real; remove it")
         self._settings = settings
@@ -137,8 +138,7 @@ class LeaderDevice(Device):
             StopRequested: The operator asked the run to stop.
         """
         self._check_open()
-        if signal != GO:
-            raise DeviceError(self._name, f"unknown signal '{signal}'; expected '{GO}'")
+        check_signal(signal, self._name)
         self._dialogue.is_waiting = True
         try:
             if simulated := self._link.arrange_go(timeout_s):
@@ -170,7 +170,7 @@ class LeaderDevice(Device):
     def new_events(self) -> Sequence[str]:
         """Messages since the last call."""
         with self._changed:
-            return self._dialogue.new_events()
+            return self._dialogue.log.new_events()
 
     def describe(self) -> Mapping[str, Any]:
         """Address, version of the protocol, deadline, and the file with the token."""
@@ -199,15 +199,15 @@ class LeaderDevice(Device):
                 case "lost", reason:
                     if rest := self._splitter.rest():
                         text = f"the leader's last line, '{rest[:40]!a}', did not end, and was dropped"
-                        self._dialogue.note(text)
+                        self._dialogue.log.note(text)
                     self._dialogue.lost(reason)
                 case "note", text:
-                    self._dialogue.note(text)
+                    self._dialogue.log.note(text)
 
     def _receive(self, data: bytes) -> None:
         for line in self._splitter.feed(data):
             if line is None:
-                self._dialogue.note("a line of the leader was too long, and was dropped")
+                self._dialogue.log.note("a line of the leader was too long, and was dropped")
                 self._send(["error the line is too long"])
             else:
                 self._send(self._dialogue.receive_line(line, self._link.now()))
@@ -232,7 +232,7 @@ class LeaderDevice(Device):
             for line in lines:
                 self._link.send(encoded(line))
         except OSError as error:
-            self._dialogue.note(f"'{lines[0]}' could not be sent to the leader: {error}")
+            self._dialogue.log.note(f"'{lines[0]}' could not be sent to the leader: {error}")
             return False
         return True
 

@@ -16,12 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
-from labseq.plugin import Context, DeviceError, DeviceTimeoutError, Simulation, format_quantity
+from labseq.plugin import Context, DeviceError, format_quantity
+from labseq.plugin.leader import GO, LeaderSettings, load_until_go
 from labseq.plugin.messages import clean
 from labseq.plugin.serial import BROKEN, Port, open_port
 from labseq.plugin.system import state_root
-from labseq_follow.protocol import GO, MAX_LINE, encoded
-from labseq_follow.settings import LeaderSettings, SerialLeaderSettings, TcpLeaderSettings
+from labseq_follow.protocol import MAX_LINE, encoded
+from labseq_follow.settings import SerialLeaderSettings, TcpLeaderSettings
 
 SLICE_S: Final = 0.02
 """Longest wait for something to come: how soon a deadline and the end are noticed."""
@@ -107,22 +108,9 @@ class SimulatedLink(Link):
 
     def arrange_go(self, timeout_s: float) -> bytes:
         """Load atoms, and send `go`."""
-        if self._delay_s > timeout_s:
-            self._context.clock.sleep(timeout_s)
-            text = f"the simulated leader says '{GO}' after {format_quantity(self._delay_s, 'time')}"
-            raise DeviceTimeoutError(self._context.name, f"{text}; see 'simulated_go_delay'", timeout_s)
-        load_atoms(self._context, self._delay_s)
+        load_until_go(self._context, self._delay_s, timeout_s)
         self._n_sent += 1
         return encoded(f"{GO} {self._n_sent}")
-
-
-def load_atoms(context: Context, duration_s: float) -> None:
-    """Load the simulated lab as the control system would have, unless this shot has atoms already."""
-    start_s = context.clock.now()
-    context.clock.sleep(duration_s)
-    simulation: Simulation | None = context.simulation
-    if simulation is not None and ((truth := simulation.truth()) is None or not truth.any()):
-        simulation.load(start_s, duration_s)
 
 
 class TcpLink(Link):

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from labseq.plugin.leader import GO, LeaderLog
 from labseq.plugin.messages import clean, visible
 
-GO: Final = "go"
 VERSION: Final = 2
 MAX_LINE: Final = 200
 """Longest line in bytes; more is noise."""
-MAX_EVENTS: Final = 100
-"""How many messages are kept; a noisy line must not fill the memory."""
 NOT_ANSWERED: Final = "error"
 """Lines that begin so are never answered, or two programs could exchange errors forever."""
 
@@ -45,14 +42,15 @@ class Dialogue:
     Attributes:
         is_waiting: Whether a step waits for `go`.
         is_connected: Whether a control system is connected.
+        log: What happened.
     """
 
     def __init__(self, deadline_s: float) -> None:
         self.is_waiting = False
         self.is_connected = False
+        self.log = LeaderLog()
         self._deadline_s = deadline_s
         self._go: _Go | None = None
-        self._events: deque[str] = deque(maxlen=MAX_EVENTS)
 
     @property
     def state(self) -> str:
@@ -64,18 +62,18 @@ class Dialogue:
     def connected(self, who: str) -> list[str]:
         """A control system has connected."""
         self.is_connected = True
-        self.note(f"{who} leads")
+        self.log.note(f"{who} leads")
         return [self._hello()]
 
     def lost(self, reason: str) -> None:
         """The control system is gone: a `go` for which no step waited is dropped; a shot goes on."""
         self.is_connected = False
-        self.note(f"the leader is gone: {reason}")
+        self.log.note(f"the leader is gone: {reason}")
         if self._go is not None and not self._go.taken:
             self._go = None
         elif self._go is not None and not self._go.answered:
             self._go.answered = "gone"
-            self.note("its shot continues; its result will not be sent")
+            self.log.note("its shot continues; its result will not be sent")
 
     def receive_line(self, line: str, now_s: float) -> list[str]:
         """Handle a line that came."""
@@ -87,7 +85,7 @@ class Dialogue:
         if word == "hello":
             return [self._hello()]
         if word:
-            self.note(f"the leader sent '{clean(line.strip())}'")
+            self.log.note(f"the leader sent '{clean(line.strip())}'")
         if not word or word == NOT_ANSWERED:
             return []
         return [f"error what is '{_one_line(line)[:40]}'? expected go, state? or hello"]
@@ -116,10 +114,10 @@ class Dialogue:
             return []
         if go.taken:
             go.answered = "late"
-            self.note("the shot is not over at the deadline; the leader received `failed`")
+            self.log.note_late()
         else:
             self._go = None
-            self.note("no step waited for `go` before its deadline; the leader received `failed`")
+            self.log.note_unawaited()
         return [_answer("failed", {"reason": "deadline"})]
 
     def end(self) -> list[str]:
@@ -127,19 +125,9 @@ class Dialogue:
         go, self._go = self._go, None
         return [] if go is None or go.answered else [_answer("failed", {"reason": "labseq ends"})]
 
-    def note(self, text: str) -> None:
-        """Keep a message for the log."""
-        self._events.append(text)
-
-    def new_events(self) -> list[str]:
-        """The messages since the last call."""
-        new_events = [*self._events]
-        self._events.clear()
-        return new_events
-
     def _receive_go(self, text: str, now_s: float) -> list[str]:
         if self._go is not None:
-            self.note("`go` came while labseq was busy, and was refused")
+            self.log.note_refused()
             return [_answer("failed", {"reason": "busy"})]
         self._go = _Go(visible(text), now_s + self._deadline_s)
         return []

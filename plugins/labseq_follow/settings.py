@@ -6,25 +6,19 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from labseq.plugin import Duration, FilePath, PositiveDuration, Settings, setting_error, wire
+from labseq.plugin import FilePath, setting_error, wire
+from labseq.plugin.leader import LeaderSettings
 from labseq.plugin.messages import clean
 from labseq.plugin.serial import port_identities
 
 SIMULATED: Final = "simulated"
 
 
-class LeaderSettings(Settings):
+class LinkSettings(LeaderSettings):
     """Settings for any connection."""
 
-    deadline: PositiveDuration = Field(
-        default=10.0, description="longest time from `go` to `ready` or `failed`; it is sent in `hello`"
-    )
     leader: Literal["real", "simulated"] = Field(
         default="real", description="simulated: a simulated control system sends `go`, as in a dry run"
-    )
-    simulated_go_delay: Duration = Field(
-        default=0.5,
-        description="time after which the simulated control system sends `go`; atoms load meanwhile",
     )
     loads: bool = Field(
         default=False,
@@ -33,7 +27,7 @@ class LeaderSettings(Settings):
     )
 
 
-class TcpLeaderSettings(LeaderSettings):
+class TcpLeaderSettings(LinkSettings):
     """An external control system that connects over TCP."""
 
     host: Annotated[str, Field(min_length=1)] = Field(
@@ -66,7 +60,7 @@ class TcpLeaderSettings(LeaderSettings):
         return self
 
 
-class SerialLeaderSettings(LeaderSettings):
+class SerialLeaderSettings(LinkSettings):
     """An external control system on a serial line: 8 data bits, no parity, 1 stop bit."""
 
     port: Annotated[str, Field(min_length=1)] = Field(

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError, format_quantity
+from labseq.plugin import ConfigError, Context, DeviceTimeoutError, format_quantity
+from labseq.plugin.leader import LeaderLog, check_signal
 from labseq_ttl.box import Box
 from labseq_ttl.lines import TtlLines
 from labseq_ttl.protocol import LATE, OWED
 from labseq_ttl.settings import GoSettings, TtlSettings
 
-GO: Final = "go"
 LOOK_S: Final = 0.2
 """Time after which the box is asked, in case its message of an edge came damaged."""
 HIGH: Final = "the start input is high: not wired, or raised too early; its next rising edge counts"
-MORE: Final = "`go` rose again while labseq was busy, and was refused"
 
 
 def ttl_lines(settings: TtlSettings, context: Context) -> TtlLines:
@@ -44,7 +42,7 @@ class GoLines(TtlLines):
         super().__init__(settings, context)
         self._go = go
         self._is_owed = False
-        self._news: deque[str] = deque(maxlen=100)
+        self._log = LeaderLog()
 
     @property
     def deadline_s(self) -> float:
@@ -70,8 +68,7 @@ class GoLines(TtlLines):
             StopRequested: The operator asked the run to stop.
         """
         box = self._opened()
-        if signal != GO:
-            raise DeviceError(self._name, f"unknown signal '{signal}'; expected '{GO}'")
+        check_signal(signal, self._name)
         timeout_s = self.access.raise_go(timeout_s)
         until_s = self._clock.now() + timeout_s
         while not self._take(box):
@@ -96,16 +93,14 @@ class GoLines(TtlLines):
         was, more_came = box.answer_leader(is_ready=state == "ready")
         self._is_owed = False
         if more_came:
-            self._news.append(MORE)
+            self._log.note_refused()
         if is_late := was == LATE:
-            self._news.append("the shot is not over at the deadline; the leader received `failed`")
+            self._log.note_late()
         return "late" if is_late else state
 
     def new_events(self) -> Sequence[str]:
         """Messages since the last call."""
-        new_events = [*self._news]
-        self._news.clear()
-        return new_events
+        return self._log.new_events()
 
     def describe(self) -> Mapping[str, Any]:
         """As for the box, with the outputs for the leader."""
@@ -120,7 +115,7 @@ class GoLines(TtlLines):
         masks = [0 if pin is None else 1 << pin for pin in pins]
         try:
             if self._opened().lead(masks, self._go.deadline if self.access.real_time else 0.0):
-                self._news.append(HIGH)
+                self._log.note(HIGH)
         except BaseException:
             self._disconnect()
             raise
@@ -131,7 +126,7 @@ class GoLines(TtlLines):
         if state not in (OWED, LATE) or self._is_owed:
             return False
         if state == LATE:
-            self._news.append("no step waited for `go` before its deadline; the leader received `failed`")
+            self._log.note_unawaited()
             box.answer_leader(is_ready=False)
             return False
         self._is_owed = True

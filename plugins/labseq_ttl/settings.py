@@ -8,6 +8,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 from pydantic import AfterValidator, Field, model_validator
 
 from labseq.plugin import Duration, Settings, setting_error
+from labseq.plugin.leader import LeaderSettings
 from labseq.plugin.serial import port_identities
 from labseq_ttl.protocol import CHANNELS
 
@@ -28,7 +29,7 @@ Channel: TypeAlias = Annotated[int, AfterValidator(_is_output)]
 """Number of an output of the box."""
 
 
-class GoSettings(Settings):
+class GoSettings(LeaderSettings):
     """An external control system: `go` is a rising edge at the start input (D8), outputs answer."""
 
     deadline: Annotated[Duration, Field(ge=0.1, le=MAX_DEADLINE_S)] = Field(
@@ -45,11 +46,6 @@ class GoSettings(Settings):
         default=None, description="output that goes high when it failed or was late, until the next `go`"
     )
     active_low: bool = Field(default=False, description="these outputs are low when they are active")
-    simulated_go_delay: Duration = Field(
-        default=0.5,
-        description="with a simulated box: time after which a simulated leader raises `go`; atoms load "
-        "meanwhile",
-    )
 
     @property
     def outputs(self) -> dict[str, int]:

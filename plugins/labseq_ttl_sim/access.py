@@ -8,7 +8,8 @@ from labseq_ttl.box import late_error
 from labseq_ttl.programs import as_played
 from labseq_ttl.settings import TtlSettings
 
-from labseq.plugin import Context, DeviceError, DeviceTimeoutError, LineProgram, format_quantity
+from labseq.plugin import Context, DeviceError, LineProgram
+from labseq.plugin.leader import load_until_go
 from labseq.plugin.serial import Port
 from labseq_ttl_sim.model import ModelBox
 from labseq_ttl_sim.simavr import SimavrBox, runner
@@ -32,6 +33,7 @@ class SimulatedAccess:
     def __init__(self, settings: TtlSettings, context: Context, polarity: int) -> None:
         self._name = context.name or "lines"
         self._settings = settings
+        self._context = context
         self._clock = context.clock
         self._simulation = context.simulation
         self._specs = context.lines
@@ -93,18 +95,7 @@ class SimulatedAccess:
             How long to wait for the box, in seconds.
         """
         assert self._settings.go is not None
-        delay_s, simulation, start_s = (
-            self._settings.go.simulated_go_delay,
-            self._simulation,
-            self._clock.now(),
-        )
-        if delay_s > timeout_s:
-            self._clock.sleep(timeout_s)
-            text = f"the simulated leader raises 'go' after {format_quantity(delay_s, 'time')}"
-            raise DeviceTimeoutError(self._name, f"{text}; see 'simulated_go_delay'", timeout_s)
-        self._clock.sleep(delay_s)
-        if simulation is not None and ((truth := simulation.truth()) is None or not truth.any()):
-            simulation.load(start_s, delay_s)
+        load_until_go(self._context, self._settings.go.simulated_go_delay, timeout_s)
         self._connected().start()
         return self.max_wait_s
 

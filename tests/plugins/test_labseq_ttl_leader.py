@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from labseq_ttl.go_lines import HIGH, MORE, GoLines
+from labseq_ttl.go_lines import HIGH, GoLines
 from labseq_ttl.protocol import CHANNELS, OUTPUTS
 from labseq_ttl.settings import GoSettings, TtlSettings
 from pydantic import ValidationError
@@ -292,7 +292,7 @@ def test_an_edge_while_labseq_is_busy_is_refused_and_reported(rig: Led) -> None:
     rig.lines.wait_for("go", 10.0)
     rig.box.start()
     rig.lines.report("ready", {})
-    assert rig.lines.new_events()[-1] == MORE
+    assert rig.lines.new_events()[-1] == "`go` came while labseq was busy, and was refused"
     assert rig.lines._opened().leader()[1] == 1
 
 
