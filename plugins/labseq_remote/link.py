@@ -36,10 +36,10 @@ class Link:
             DeviceError: The server does not answer, or refuses.
         """
         if self._connection is None:
-            self._connection = connection = Connection(self.settings, self._context, self._kind)
+            connection = Connection(self.settings, self._context, self._kind, self._state)
+            self._connection = connection
             weakref.finalize(self, connection.abandon)
             self._about = connection.about
-            connection.state = self._state = {**self._state, **connection.state}
         return self._connection
 
     def call(self, name: str, *args: Any, **named: Any) -> Any:
@@ -71,7 +71,7 @@ class Link:
 
     def open(self) -> None:
         """Connect, and open the device for this client alone."""
-        if self._connection is not None and self._connection.lost:
+        if self._connection is not None and self._connection.life.lost:
             self.end()
         try:
             self.connect().call("open", stoppable=False)

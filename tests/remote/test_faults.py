@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
-from labseq_remote import connection
+from labseq_remote import control
+from labseq_remote.connection import served_context
 from labseq_remote.drivers import (
     RemoteCamera,
     RemoteDevice,
@@ -175,11 +176,11 @@ def test_both_sides_notice_a_cut(server: Served, faulty: Proxy, monkeypatch: pyt
     n_told = len(server.told)
     faulty.is_cut = True
     monkeypatch.setattr(labseq.remote.server, "LOST_S", 0.3)
+    monkeypatch.setattr(wire_of_plugins, "LOST_S", 0.3)
     for name, device in devices.items():
-        device.link.connect()._lost_s = 0.3
         until(lambda name=name: any(f"{name}: the" in text for text in server.told[n_told:]))
         assert "made safe" in next(text for text in server.told[n_told:] if f"{name}: the" in text)
-        until(lambda device=device: bool(device.link.connect().lost))
+        until(lambda device=device: bool(device.link.connect().life.lost))
         with pytest.raises(DeviceError, match=rf"^{name}: the connection is lost.*127\.0\.0\.2"):
             device.safe_state()
         with suppress(DeviceError):
@@ -189,9 +190,11 @@ def test_both_sides_notice_a_cut(server: Served, faulty: Proxy, monkeypatch: pyt
         again.command("open")
 
 
-def test_a_lost_reply_ends_the_connection(server: Served, faulty: Proxy) -> None:
+def test_a_lost_reply_ends_the_connection(
+    server: Served, faulty: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with instrument(server, PROXY) as device:
-        device.link.connect()._lost_s = 0.5
+        monkeypatch.setattr(wire_of_plugins, "LOST_S", 0.5)
         faulty.reply_fault = lambda message: [] if b"state" in message[0] else [message]
         with pytest.raises(DeviceError, match="no reply"):
             device.command("open")
@@ -291,10 +294,10 @@ def test_a_server_that_has_ended_is_not_waited_for_again(
         device = RemoteDevice(one.settings("instrument"), Context("laser", clock=FakeClock()))
         device.open()
         connection = device.link.connect()
-    until(lambda: bool(connection.lost))
+    until(lambda: bool(connection.life.lost))
     begun_s = time.monotonic()
     with pytest.raises(DeviceError, match="the server has ended"):
-        connection.ask("beat")
+        connection.control.ask("beat")
     assert time.monotonic() < begun_s + 10.0
 
 
@@ -327,13 +330,13 @@ def test_another_version_is_named(server: Served, monkeypatch: pytest.MonkeyPatc
 
 
 def test_no_server_is_named(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "CONNECT_S", 0.2)
+    monkeypatch.setattr(control, "CONNECT_S", 0.2)
     with pytest.raises(DeviceError, match="nothing answers there"):
         RemoteCamera(server.settings("camera", port=1), Context("camera", clock=FakeClock())).open()
 
 
 def test_keys(tmp_path: Path, keys: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "CONNECT_S", 1.0)
+    monkeypatch.setattr(control, "CONNECT_S", 1.0)
     with served(tmp_path, plain=False) as one:
 
         def with_key(name: str | None = None) -> RemoteDevice:
@@ -463,7 +466,7 @@ def test_times_of_frames_are_on_the_clock_of_the_client(
     server: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with camera(server) as device:
-        clock = device.link.connect()._clock
+        clock = device.link.connect()._calls._clock
         monkeypatch.setattr(clock, "now", lambda: time.monotonic() + 1000.0)  # not that of the server
         device.arm(1, 0.01, "software")
         before_s = clock.now()
@@ -494,7 +497,7 @@ def test_a_client_cannot_replace_the_driver_of_an_open_device(server: Served) ->
     with instrument(server) as device:
         connection = device.link.connect()
         with pytest.raises(DeviceError, match="already has a driver"):
-            connection.call("attach", connection._about(Context("laser")))
+            connection.call("attach", served_context("laser", Context("laser")))
         device.command("open")
 
 
