@@ -69,14 +69,6 @@ def serve_devices(
             show_default=False,
         ),
     ] = None,
-    key: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="Which of this computer's keys to use, if it has several.",
-            show_default=False,
-        ),
-    ] = "",
     plain: Annotated[
         bool, typer.Option("--plain", help="Without keys, for programs on this computer only.")
     ] = False,
@@ -91,4 +83,4 @@ def serve_devices(
     from labseq.console.output import say
     from labseq.remote.server import Serving, serve_devices
 
-    serve_devices(profile, overrides or (), Serving(bind, tuple(device or ()), key, plain), say)
+    serve_devices(profile, overrides or (), Serving(bind, tuple(device or ()), plain), say)

@@ -69,13 +69,11 @@ class Serving:
     Attributes:
         address: ``tcp://HOST:PORT``: the port of the control, and the first of those of the devices.
         devices: Roles and names of devices; none for all real ones of the profile, or all if none is real.
-        key: Which of this computer's keys; "" for the only one.
         plain: Whether to serve without keys, on this computer only.
     """
 
     address: str
     devices: tuple[str, ...] = ()
-    key: str = ""
     plain: bool = False
 
 
@@ -116,7 +114,7 @@ def serving(
         raise ConfigError(
             Problem(f"{options.address} can be reached from other computers, and needs keys", hint=hint)
         )
-    keys = None if options.plain else find_keys(keys_root(), options.key)
+    keys = None if options.plain else find_keys(keys_root())
     whole = resolve_profile(profile, overrides=profile_overrides(overrides))
     hardware = replace(whole, chosen=_served(whole, options.devices))
     simulation = None

@@ -78,20 +78,19 @@ def _content(public: bytes, secret: bytes = b"") -> bytes:
     return text + (b'    secret-key = "' + secret + b'"\n' if secret else b"")
 
 
-def find_keys(folder: Path, name: str = "") -> Keys:
+def find_keys(folder: Path) -> Keys:
     """The keys of this computer.
 
     Args:
         folder: The folder of keys.
-        name: Which of them; "" for the only one.
 
     Raises:
-        ConfigError: There are none, or several and no name; or the file is damaged.
+        ConfigError: There are none, or several; or the file is damaged.
     """
-    files = sorted(folder.glob(f"{name or '*'}{SECRET}"))
+    files = sorted(folder.glob(f"*{SECRET}"))
     if len(files) != 1:
-        problem = "there are several keys" if files else "this computer has no key"
-        hint = "name one of them with `key`" if files else "'labseq keys new' makes one"
+        problem = "there are several keys of this computer" if files else "this computer has no key"
+        hint = "keep one of them in this folder" if files else "'labseq keys new' makes one"
         raise ConfigError(Problem(problem, str(folder), hint=hint))
     keys = _read(files[0])
     if len(keys) != 2:

@@ -125,4 +125,4 @@ def _keys(settings: RemoteSettings) -> tuple[Any, bytes | None]:
         return None, None
     root = wire.keys_root()
     name = settings.server_key or settings.host
-    return wire.find_keys(root, settings.key or ""), wire.read_public(root / "known" / f"{name}.key")
+    return wire.find_keys(root), wire.read_public(root / "known" / f"{name}.key")

@@ -1,4 +1,4 @@
-"""Where a device is, and the keys for it."""
+"""Where a device is, and the key of its server."""
 
 from __future__ import annotations
 
@@ -21,15 +21,12 @@ def _address(value: str) -> str:
 
 
 class RemoteSettings(Settings):
-    """The server of a device, its name there, and the keys."""
+    """The server of a device, its name there, and its key."""
 
     address: Annotated[str, AfterValidator(_address)] = Field(
         description="address of the server, as `labseq serve-devices` prints it: tcp://HOST:PORT"
     )
     device: Text = Field(description="role or name of the device in the profile of its computer")
-    key: Text | None = Field(
-        default=None, description="which of this computer's keys; by default the only one"
-    )
     server_key: Text | None = Field(
         default=None, description="name of the server's public key in the folder `known`; by default its host"
     )

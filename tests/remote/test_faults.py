@@ -339,16 +339,20 @@ def test_keys(tmp_path: Path, keys: Path, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(control, "CONNECT_S", 1.0)
     with served(tmp_path, plain=False) as one:
 
-        def with_key(name: str | None = None) -> RemoteDevice:
-            settings = one.settings("instrument", server_key="here", key=name or "here")
+        def with_key() -> RemoteDevice:
+            settings = one.settings("instrument", server_key="here")
             return RemoteDevice(settings, Context("laser", clock=FakeClock()))
 
         device = with_key()
         device.open()
         device.command("open")
-        wire.new_keys("stranger", keys)
-        with pytest.raises(DeviceError, match="does not know the key"):
-            with_key("stranger").open()
+        stranger = tmp_path / "stranger"
+        wire.new_keys("stranger", stranger)
+        (stranger / "known" / "here.key").write_bytes((keys / "here.key").read_bytes())
+        with monkeypatch.context() as patch:
+            patch.setattr(wire_of_plugins, "keys_root", lambda: stranger)
+            with pytest.raises(DeviceError, match="does not know the key"):
+                with_key().open()
         with pytest.raises(DeviceError, match="keys do not fit"):  # without keys
             RemoteDevice(one.settings("instrument"), Context("laser", clock=FakeClock())).open()
         secret = keys / "known" / "here.key"
@@ -379,6 +383,12 @@ except OSError as error:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes have no limit of open files")
+def test_a_computer_has_one_key(keys: Path) -> None:
+    wire.new_keys("another", keys)
+    with pytest.raises(ConfigError, match="there are several keys of this computer; keep one of them"):
+        wire.find_keys(keys)
+
+
 def test_keys_that_cannot_be_read_are_not_taken_for_withdrawn_ones(tmp_path: Path) -> None:
     _, public = wire.new_keys("here", tmp_path)
     (tmp_path / "known" / "here.key").write_bytes(public.read_bytes())
