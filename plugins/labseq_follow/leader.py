@@ -17,9 +17,10 @@ from labseq.plugin import (
 )
 from labseq.plugin.leader import GO, check_signal, load_atoms
 from labseq.plugin.messages import one_of
-from labseq_follow.links import Event, Link, SerialLink, SimulatedLink, TcpLink
+from labseq_follow.links import Event, Link, SerialLink, SimulatedLink
 from labseq_follow.protocol import VERSION, About, Dialogue, Splitter, encoded
 from labseq_follow.settings import SIMULATED, LinkSettings, SerialLeaderSettings, TcpLeaderSettings
+from labseq_follow.tcp import TcpLink
 
 LOADING_S: Final = 0.25
 """How long atoms load in a simulated lab with a real control system: five times the simulation's own time."""

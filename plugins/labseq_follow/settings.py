@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from labseq.plugin import FilePath, setting_error, wire
+from labseq.plugin import setting_error, wire
 from labseq.plugin.leader import LeaderSettings
 from labseq.plugin.messages import clean
 from labseq.plugin.serial import port_identities
@@ -36,13 +36,10 @@ class TcpLeaderSettings(LinkSettings):
     port: int = Field(
         default=5750, ge=0, le=65535, description="port on which labseq listens; 0: any free one"
     )
-    token_file: FilePath | None = Field(
-        default=None,
-        description="file with the token that a control system must send first, 16 to 100 letters or "
-        "digits; without it `leader.token` in the state folder, which labseq makes",
-    )
     allow_remote: bool = Field(
-        default=False, description="whether other computers may connect, with the token"
+        default=False,
+        description="whether other computers may connect; they need the token, which labseq keeps in "
+        "`leader.token` of its state folder",
     )
 
     def identities(self) -> tuple[str, ...]:

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 from labseq_follow.leader import LeaderDevice, serial_leader
-from labseq_follow.links import MAX_NEWCOMERS
 from labseq_follow.settings import SerialLeaderSettings
+from labseq_follow.tcp import MAX_NEWCOMERS
 
 from labseq.plugin import Context, DeviceError, DeviceTimeoutError
 
