@@ -31,9 +31,6 @@ class RealBox:
         self._port = port
         self._device = device
 
-    def warm(self) -> None:
-        """Do what takes long before the first shot: nothing."""
-
     def connect(self) -> Port:
         """Open the serial port of the box."""
         return open_box(self._port, self._device)
@@ -60,10 +57,10 @@ class RealBox:
         return timeout_s
 
 
-def choose_box(settings: TtlSettings, context: Context, polarity: int) -> RealBox | SimulatedAccess:
-    """The box that the setting ``port`` names; ``polarity`` has the outputs that are low when they are on."""
+def choose_box(settings: TtlSettings, context: Context) -> RealBox | SimulatedAccess:
+    """The box that the setting ``port`` names."""
     if not settings.is_simulated:
         return RealBox(settings.port, context.name or "lines")
     from labseq_ttl_sim import SimulatedAccess
 
-    return SimulatedAccess(settings, context, polarity)
+    return SimulatedAccess(settings, context)

@@ -241,22 +241,6 @@ class Box(Conversation):
         """Read what it is doing; it does not answer while a program runs."""
         return BoxState(*self._numbers(self.ask("state", tries=tries)[1:], 4))
 
-    def set_polarity(self, mask: int) -> None:
-        """Store permanently which outputs are low when they are on."""
-        self.ask(f"polarity {mask:x}")
-
-    def set_serial_number(self, number: int) -> None:
-        """Store a serial number permanently."""
-        self.ask(f"serial {number:x}")
-
-    def set_watchdog_timeout(self, timeout_s: float) -> None:
-        """Turn all lines off if nothing is received for this long; 0: never."""
-        self.ask(f"timeout {round(timeout_s * 1e3):x}")
-
-    def set_lines(self, mask: int) -> None:
-        """Turn lines on and off at once."""
-        self.ask(f"set {mask:x}")
-
     def put(self, slot: int, edges: Sequence[Edge]) -> None:
         """Write a program."""
         for first in range(0, len(edges), PER_LINE):
@@ -295,13 +279,29 @@ class Box(Conversation):
         (level,) = self._numbers(self.ask(f"lead {words}"), 1)
         return bool(level)
 
+    def answer_leader(self, *, is_ready: bool) -> list[int]:
+        """Raise `ready` or `failed`; returns the state before, and whether an edge was refused meanwhile."""
+        return self._numbers(self.ask(f"answer {is_ready:d}"), 2)
+
     def leader(self) -> list[int]:
         """State towards the leader, edges accepted, whether one was refused, level of the start input."""
         return self._numbers(self.ask("leader"), 4)
 
-    def answer_leader(self, *, is_ready: bool) -> list[int]:
-        """Raise `ready` or `failed`; returns the state before, and whether an edge was refused meanwhile."""
-        return self._numbers(self.ask(f"answer {is_ready:d}"), 2)
+    def set_lines(self, mask: int) -> None:
+        """Turn lines on and off at once."""
+        self.ask(f"set {mask:x}")
+
+    def set_watchdog_timeout(self, timeout_s: float) -> None:
+        """Turn all lines off if nothing is received for this long; 0: never."""
+        self.ask(f"timeout {round(timeout_s * 1e3):x}")
+
+    def set_polarity(self, mask: int) -> None:
+        """Store permanently which outputs are low when they are on."""
+        self.ask(f"polarity {mask:x}")
+
+    def set_serial_number(self, number: int) -> None:
+        """Store a serial number permanently."""
+        self.ask(f"serial {number:x}")
 
     def _first_answer(self) -> list[str]:
         deadline_s = time.monotonic() + max(BOOT_S, self._max_wait_s)

@@ -67,7 +67,7 @@ class TtlLines(Lines):
         self._names = tuple(spec.name for spec in self._specs)
         self._polarity = mask_of([spec.active_low for spec in self._specs], self._specs)
         self._polarity |= 0 if settings.go is None else settings.go.polarity
-        self.access = choose_box(settings, context, self._polarity)
+        self.access = choose_box(settings, context)
         self._box: Box | None = None
         self._identity = Identity(0, 0, "")
         self._heartbeat: Heartbeat | None = None
@@ -80,10 +80,6 @@ class TtlLines(Lines):
     def lines_facts(self) -> LinesFacts:
         """Channels and limits."""
         return LinesFacts(CHANNELS, TICK_S, SHORTEST_S, MAX_EDGES, LATENCY_S)
-
-    def warm(self) -> None:
-        """Do what takes long before the first shot."""
-        self.access.warm()
 
     def open(self) -> None:
         """Connect to the box, which turns all lines off. No effect if it is open.

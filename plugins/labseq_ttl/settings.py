@@ -93,12 +93,6 @@ class TtlSettings(Settings):
         description="how long the box waits for a sign of life from labseq before it turns all lines off, "
         "while no program runs; 0: for ever",
     )
-    simulated_by: Literal["python", "simavr"] = Field(
-        default="python",
-        description="what a simulated box is: `python`, a model of it, or `simavr`, the firmware itself on a "
-        "simulated processor",
-    )
-
     go: GoSettings | None = Field(
         default=None,
         description="lets an external control system start the shots through the box, see "

@@ -1,4 +1,4 @@
-"""Simulated boxes for ``labseq_ttl``: a model of the box, or its firmware on a simulated processor."""
+"""A simulated box for ``labseq_ttl``."""
 
 from labseq_ttl_sim.access import SimulatedAccess
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from labseq_ttl.access import MAX_WAIT_S
 from labseq_ttl.box import late_error
 from labseq_ttl.programs import as_played
 from labseq_ttl.settings import TtlSettings
@@ -12,7 +13,6 @@ from labseq.plugin import Context, DeviceError, LineProgram
 from labseq.plugin.leader import load_until_go
 from labseq.plugin.serial import Port
 from labseq_ttl_sim.model import ModelBox
-from labseq_ttl_sim.simavr import SimavrBox, runner
 
 ROUNDING_S: Final = 1e-9
 
@@ -20,40 +20,26 @@ ROUNDING_S: Final = 1e-9
 class SimulatedAccess:
     """A simulated box. It plays a program at once, while the session's clock decides how long that takes.
 
-    Args:
-        polarity: Outputs that are low when they are on: bit n is channel n.
-
     Attributes:
         box: The box, while connected.
     """
 
-    max_wait_s = 15.0  # on a busy computer
+    max_wait_s = MAX_WAIT_S
     real_time = False
 
-    def __init__(self, settings: TtlSettings, context: Context, polarity: int) -> None:
+    def __init__(self, settings: TtlSettings, context: Context) -> None:
         self._name = context.name or "lines"
         self._settings = settings
         self._context = context
         self._clock = context.clock
         self._simulation = context.simulation
         self._specs = context.lines
-        self._polarity = polarity
-        self.box: ModelBox | SimavrBox | None = None
-
-    def warm(self) -> None:
-        """Compile what runs the firmware, unless the box is the model."""
-        if self._settings.simulated_by == "simavr":
-            runner(self._name)
+        self.box: ModelBox | None = None
 
     def connect(self) -> Port:
         """Turn a new box on; returns its serial port, open."""
         self.box = self._new_box()
         return self.box.port
-
-    def _new_box(self) -> ModelBox | SimavrBox:
-        if self._settings.simulated_by == "simavr":
-            return SimavrBox(self._name, self._clock)
-        return ModelBox()
 
     def disconnect(self) -> None:
         """Turn the box off; no effect if there is none."""
@@ -68,7 +54,7 @@ class SimulatedAccess:
 
     def fired(self, program: LineProgram | None) -> None:
         """The driver has fired a program: pass what the outputs did to the simulation."""
-        edges = self._connected().played(self._polarity)
+        edges = self._connected().played()
         if program is not None:
             self.lines_set(as_played(edges, program, self._specs))
 
@@ -99,7 +85,10 @@ class SimulatedAccess:
         self._connected().start()
         return self.max_wait_s
 
-    def _connected(self) -> ModelBox | SimavrBox:
+    def _new_box(self) -> ModelBox:
+        return ModelBox()
+
+    def _connected(self) -> ModelBox:
         if self.box is None:
             raise DeviceError(self._name, "the simulated box is not connected")
         return self.box

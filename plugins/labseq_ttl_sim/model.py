@@ -122,20 +122,20 @@ class ModelBox:
         self._commands: dict[str, tuple[Callable[..., str | None], tuple[int, ...] | None]] = {
             "id": (self._identify, None),
             "state": (self._state, None),
-            "polarity": (partial(setattr, self, "_polarity"), (OUTPUTS,)),
-            "serial": (partial(setattr, self, "_serial"), (0xFFFF,)),
-            "set": (partial(setattr, self, "on"), (OUTPUTS,)),
-            "timeout": (partial(setattr, self, "_timeout_ms"), (0xFFFF,)),
             "put": (self._put, None),
             "get": (self._get, (SLOTS - 1, EDGES - 1)),
             "arm": (self._arm, (SLOTS - 1, EDGES)),
             "fire": (self._fire, ()),
             "await": (self._await, ()),
-            "off": (self._off, None),
             "lead": (self._begin_leading, (OUTPUTS, OUTPUTS, OUTPUTS, MAX_MS)),
-            "deaf": (self._end_leading, None),
             "answer": (self._answer_leader, (1,)),
             "leader": (self._report_to_leader, None),
+            "deaf": (self._end_leading, None),
+            "set": (partial(setattr, self, "on"), (OUTPUTS,)),
+            "off": (self._off, None),
+            "timeout": (partial(setattr, self, "_timeout_ms"), (0xFFFF,)),
+            "polarity": (partial(setattr, self, "_polarity"), (OUTPUTS,)),
+            "serial": (partial(setattr, self, "_serial"), (0xFFFF,)),
         }  # with the upper limits of their arguments; None: they are not looked at. The model has no clock
         self._out = bytearray()
         self._polarity = self._serial = 0
@@ -183,9 +183,8 @@ class ModelBox:
     def close(self) -> None:
         """Nothing is open."""
 
-    def played(self, polarity: int) -> list[Edge]:
-        """What the outputs did since the start of the last program; see :meth:`SimavrBox.played`."""
-        del polarity  # the model records what is on, not the levels
+    def played(self) -> list[Edge]:
+        """Edges of the last program: ticks since the first, and what was on from then on."""
         return self._edges
 
     def reset(self, after_ticks: int | None = None) -> None:
@@ -322,6 +321,26 @@ class ModelBox:
         if self._armed is None:
             raise RefusedError("unarmed")
 
+    def _begin_leading(self, busy: int, ready: int, failed: int, _deadline_ms: int) -> str:
+        self._leader.begin(busy, ready, failed)
+        return f"{self._leader.level:02x}"
+
+    def _answer_leader(self, is_ready: int) -> str:
+        if self._leader.state == DEAF:
+            raise RefusedError("deaf")
+        return self._leader.answer(is_ready=bool(is_ready))
+
+    def _report_to_leader(self) -> str:
+        leader = self._leader
+        return f"{leader.state:02x} {leader.n_go_signals:04x} {leader.more_came:02x} {leader.level:02x}"
+
+    def _end_leading(self) -> None:
+        self._leader.end()
+
+    def _off(self) -> None:
+        self._armed, self.on = None, 0
+        self._waits = False
+
     def _play(self) -> None:
         """Play the armed program; a reset that is due in its middle ends it."""
         assert self._armed is not None
@@ -339,23 +358,3 @@ class ModelBox:
             self.on = mask
         self._runs = (self._runs + 1) & 0xFFFF
         self._send(f"!done {self._boots:04x} {self._runs:04x}")
-
-    def _begin_leading(self, busy: int, ready: int, failed: int, _deadline_ms: int) -> str:
-        self._leader.begin(busy, ready, failed)
-        return f"{self._leader.level:02x}"
-
-    def _end_leading(self) -> None:
-        self._leader.end()
-
-    def _answer_leader(self, is_ready: int) -> str:
-        if self._leader.state == DEAF:
-            raise RefusedError("deaf")
-        return self._leader.answer(is_ready=bool(is_ready))
-
-    def _report_to_leader(self) -> str:
-        leader = self._leader
-        return f"{leader.state:02x} {leader.n_go_signals:04x} {leader.more_came:02x} {leader.level:02x}"
-
-    def _off(self) -> None:
-        self._armed, self.on = None, 0
-        self._waits = False

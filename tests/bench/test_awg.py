@@ -102,13 +102,8 @@ def test_streamed_samples_move_atoms_as_replayed_ones_do(run: RunProfile) -> Non
 
 
 @pytest.mark.needs("libaravis")
-@pytest.mark.parametrize(
-    "simulated_by", ["python", pytest.param("simavr", marks=pytest.mark.needs("firmware"))]
-)
-def test_a_run_through_every_driver_is_the_one_through_virtual_devices(
-    run: RunProfile, simulated_by: str
-) -> None:
-    bench = run("bench", f"profile.lines.simulated_by={simulated_by}", shots=1)
+def test_a_run_through_every_driver_is_the_one_through_virtual_devices(run: RunProfile) -> None:
+    bench = run("bench", shots=1)
     expected = run("bench_awg", *TRIGGERED, *UNEVEN)
     assert bench.simulated
     compare_flights(bench.shots[0], expected.shots[0])  # depths follow what the radio sent

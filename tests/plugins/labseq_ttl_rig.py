@@ -15,20 +15,45 @@ import pytest
 from labseq_ttl.box import Box
 from labseq_ttl.go_lines import ttl_lines
 from labseq_ttl.lines import TtlLines
+from labseq_ttl.programs import mask_of
 from labseq_ttl.protocol import framed, unframed
 from labseq_ttl.settings import TtlSettings
+from labseq_ttl_sim import SimulatedAccess
 from labseq_ttl_sim.model import ModelBox
-from labseq_ttl_sim.simavr import SimavrBox
 
 from labseq.plugin import Context, LineProgram, LineSpec
-from labseq.roles.shot import NeverStopped
 from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.instruments import SPECS
 from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 
+from .labseq_ttl_simavr import SimavrBox
+
 MAX_WAIT_S = 60.0
-FIRMWARE = pytest.param("simavr", marks=pytest.mark.needs("firmware"))
-"""The value of ``simulated_by`` for the firmware itself."""
+FIRMWARE = pytest.param("firmware", marks=pytest.mark.needs("firmware"))
+"""What a simulated box is; else "model"."""
+
+
+class FirmwareAccess(SimulatedAccess):
+    """A simulated box that is the firmware itself, in the place of the model."""
+
+    max_wait_s = 15.0  # on a busy computer
+
+    def __init__(self, settings: TtlSettings, context: Context) -> None:
+        super().__init__(settings, context)
+        active_low = mask_of([spec.active_low for spec in context.lines], context.lines)
+        self._polarity = active_low | (0 if settings.go is None else settings.go.polarity)
+
+    def _new_box(self) -> Any:
+        return SimavrBox(self._polarity)
+
+
+@contextmanager
+def simulated_by(box: str) -> Generator[None]:
+    """While it is open, simulated boxes are these: "model" or "firmware"."""
+    with pytest.MonkeyPatch.context() as patch:
+        if box == "firmware":
+            patch.setattr("labseq_ttl.lines.choose_box", FirmwareAccess)
+        yield
 
 
 @dataclass
@@ -68,12 +93,13 @@ class Rig:
         return program
 
 
-def make_rig(specs: tuple[LineSpec, ...] = SPECS, **settings: Any) -> Rig:
+def make_rig(specs: tuple[LineSpec, ...] = SPECS, box: str = "model", **settings: Any) -> Rig:
     """A driver that is not open."""
     clock = FakeClock()
     world = RecordingSimulation(Calls(clock))
     context = Context("lines", clock=clock, simulation=world, lines=specs)
-    return Rig(ttl_lines(TtlSettings.model_validate(settings), context), clock, world, specs)
+    with simulated_by(box):
+        return Rig(ttl_lines(TtlSettings.model_validate(settings), context), clock, world, specs)
 
 
 @contextmanager
@@ -141,7 +167,7 @@ class FirmwareOnACable(SimavrBox):
     """The firmware at the end of a cable."""
 
     def __init__(self) -> None:
-        super().__init__("lines", NeverStopped())
+        super().__init__()
 
     def unplug(self) -> None:
         """End its process, whose pty goes with it; repeatable."""
@@ -152,7 +178,7 @@ class Firmware:
     """The firmware on its simulated processor, spoken to line by line."""
 
     def __init__(self) -> None:
-        self.simavr = SimavrBox("lines", NeverStopped())
+        self.simavr = SimavrBox()
         self._port: Any = self.simavr.port
         self._port.timeout = MAX_WAIT_S
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -22,7 +22,7 @@ from labseq.plugin import Context
 from labseq.sequencer.lines import line_program
 from labseq.testing import LinesContract
 
-from .labseq_ttl_rig import FIRMWARE, make_rig, rig
+from .labseq_ttl_rig import FIRMWARE, make_rig, rig, simulated_by
 
 
 class TestModel(LinesContract):
@@ -34,13 +34,14 @@ class TestModel(LinesContract):
 @pytest.mark.needs("firmware")
 class TestFirmware(LinesContract):
     @pytest.fixture
-    def factory(self) -> Callable[[Context], TtlLines]:
-        return partial(TtlLines, TtlSettings(simulated_by="simavr"))
+    def factory(self) -> Generator[Callable[[Context], TtlLines]]:
+        with simulated_by("firmware"):
+            yield partial(TtlLines, TtlSettings())
 
 
-@pytest.mark.parametrize("simulated_by", ["python", FIRMWARE])
-def test_the_self_test_changes_no_line(simulated_by: str) -> None:
-    with rig(simulated_by=simulated_by) as lab:
+@pytest.mark.parametrize("box", ["model", FIRMWARE])
+def test_the_self_test_changes_no_line(box: str) -> None:
+    with rig(box=box) as lab:
         lab.lines.idle()
         n_played = len(lab.played)
         lab.lines.self_test()
@@ -183,7 +184,7 @@ def run(folder: Path, use: str, dry_run: Literal["off", "full"] = "off") -> Run:
 WAYS: dict[str, tuple[str, Literal["off", "full"]]] = {
     "model": ("ttl\n  port: simulated", "off"),
     "dry run": ("ttl\n  port: /dev/ttyACM0\n  start: external", "full"),
-    "firmware": ("ttl\n  port: simulated\n  simulated_by: simavr", "off"),
+    "firmware": ("ttl\n  port: simulated", "off"),
 }
 
 
@@ -193,14 +194,13 @@ def virtual(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return run(tmp_path_factory.mktemp("virtual") / "run", "virtual")
 
 
-@pytest.mark.parametrize(
-    "way", ["model", "dry run", pytest.param("firmware", marks=pytest.mark.needs("firmware"))]
-)
+@pytest.mark.parametrize("way", ["model", "dry run", FIRMWARE])
 def test_a_simulated_box_switches_the_lines_as_the_virtual_one_does(
     way: str, virtual: Run, tmp_path: Path
 ) -> None:
     use, dry_run = WAYS[way]
-    simulated = run(tmp_path / "run", use, dry_run)
+    with simulated_by(way):
+        simulated = run(tmp_path / "run", use, dry_run)
     assert simulated.simulated
     for one, expected in zip(simulated.shots, virtual.shots, strict=True):
         np.testing.assert_array_equal(one.occupancies, expected.occupancies)

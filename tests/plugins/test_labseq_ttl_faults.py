@@ -14,7 +14,6 @@ from labseq_ttl.__main__ import main
 from labseq_ttl.lines import Heartbeat
 from labseq_ttl.protocol import STOP, framed
 from labseq_ttl_sim.model import ModelBox
-from labseq_ttl_sim.simavr import runner
 
 from labseq.errors import DeviceError, DeviceTimeoutError, StopRequested
 from labseq.roles import NeverStopped
@@ -26,10 +25,10 @@ MIDDLE = 10_000
 """Ticks: 5 ms after the first edge."""
 
 
-@pytest.fixture(params=["python", FIRMWARE])
+@pytest.fixture(params=["model", FIRMWARE])
 def lab(request: pytest.FixtureRequest) -> Generator[Rig]:
     """A driver, open, on a simulated box."""
-    with rig(simulated_by=request.param) as made:
+    with rig(box=request.param) as made:
         yield made
 
 
@@ -292,28 +291,6 @@ def test_a_bad_memory_is_found_by_the_self_test(monkeypatch: pytest.MonkeyPatch)
             lab.lines.self_test()
 
 
-def test_what_is_missing_for_simavr_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
-    monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(DeviceError, match=r"no C compiler; `apt-get install .* libsimavr-dev"):
-        runner("lines")
-
-
-@pytest.mark.needs("firmware")
-def test_what_takes_long_is_done_before_the_box_is_opened(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path))
-    make_rig().lines.warm()
-    assert not list(tmp_path.rglob("runner"))  # the model needs nothing
-    lines = make_rig(simulated_by="simavr").lines
-    lines.warm()
-    assert list(tmp_path.rglob("runner"))
-    monkeypatch.setenv("PATH", "")
-    lines.open()
-    lines.close()
-
-
 class Plugged:
     """A box at the end of a cable, under a name that no other port gets when it is unplugged."""
 
@@ -330,14 +307,14 @@ class Plugged:
 on_a_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
 
 
-@pytest.fixture(params=[pytest.param("python", marks=on_a_pty), FIRMWARE])
+@pytest.fixture(params=[pytest.param("model", marks=on_a_pty), FIRMWARE])
 def plugged(
     request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Generator[Plugged]:
     """A box at a serial port of this computer: the model, and the firmware. Both answer late under load."""
     monkeypatch.setattr("labseq_ttl.access.RealBox.max_wait_s", MAX_WAIT_S)
     monkeypatch.setattr("labseq_ttl.__main__.MAX_WAIT_S", MAX_WAIT_S)
-    kind = FirmwareOnACable if request.param == "simavr" else ModelOnACable
+    kind = FirmwareOnACable if request.param == "firmware" else ModelOnACable
     plugged = Plugged(kind(), tmp_path / "ttyACM0")
     yield plugged
     plugged.unplug()

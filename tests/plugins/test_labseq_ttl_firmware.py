@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from labseq_ttl.lines import LATENCY_S
 from labseq_ttl.protocol import CHANNELS, EDGES, OUTPUTS, SHORTEST, SLOTS, framed, unframed
 from labseq_ttl_sim.model import ModelBox
-from labseq_ttl_sim.simavr import APART_CYCLES, CYCLES_PER_TICK, FIRMWARE
 
 from .labseq_ttl_rig import FIRMWARE as WITH_FIRMWARE, Firmware
+from .labseq_ttl_simavr import APART_CYCLES, CYCLES_PER_TICK, FIRMWARE
 
 CLOCK_HZ = 16e6
 ERROR_CYCLES = 3

@@ -199,9 +199,9 @@ def rig() -> Generator[Led]:
     made.lines.close()
 
 
-@pytest.mark.parametrize("simulated_by", ["python", FIRMWARE])
-def test_go_comes_by_the_pin_and_is_answered(simulated_by: str) -> None:
-    made = Led(simulated_by=simulated_by)
+@pytest.mark.parametrize("box", ["model", FIRMWARE])
+def test_go_comes_by_the_pin_and_is_answered(box: str) -> None:
+    made = Led(box=box)
     made.lines.open()
     try:
         for state, n_go_signals in (("ready", 1), ("failed", 2)):
@@ -209,7 +209,7 @@ def test_go_comes_by_the_pin_and_is_answered(simulated_by: str) -> None:
             assert made.lines._opened().leader()[1] == n_go_signals
             assert made.lines.report(state, {"shot": 0}) == state
             assert made.lines.report(state, {"shot": 0}) == ""  # it has its answer
-            if simulated_by == "python":
+            if box == "model":
                 assert made.box.signals == 1 << (READY if state == "ready" else FAILED)
     finally:
         made.lines.close()

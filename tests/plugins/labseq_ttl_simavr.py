@@ -1,11 +1,10 @@
-"""The firmware itself, on a simulated processor (simavr) in a separate process."""
+"""The firmware of the timing box itself, on a simulated processor (simavr) in a separate process."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import select
-import shutil
 import subprocess
 import tempfile
 from contextlib import suppress
@@ -16,17 +15,12 @@ import labseq_ttl
 from labseq_ttl.box import open_box
 from labseq_ttl.protocol import OUTPUTS, Edge
 
-from labseq.plugin import Clock, DeviceError, wait_for
+from labseq.plugin import wait_for
 from labseq.plugin.serial import BROKEN, Port
-from labseq.plugin.system import cache_root
+from labseq.plugin.system import NeverStopped, cache_root
 
-SOURCE: Final = Path(__file__).with_name("runner.c")
+SOURCE: Final = Path(__file__).with_name("labseq_ttl_runner.c")
 FIRMWARE: Final = Path(labseq_ttl.__file__).parent / "firmware" / "labseq_ttl.hex"
-PACKAGES: Final = "gcc libc6-dev libsimavr-dev libelf-dev"
-"""Debian packages that the runner needs."""
-
-COMPILE_TIMEOUT_S: Final = 120.0
-_LIBRARIES: Final = ("-lsimavr", "-lelf", "-lutil")
 CYCLES_PER_TICK: Final = 8
 GATE: Final = 1 << 13
 APART_CYCLES: Final = 3
@@ -42,15 +36,17 @@ class SimavrBox:
     Attributes:
         name: Name of its serial port.
         port: The port.
+
+    Args:
+        polarity: Outputs that are low when they are on.
     """
 
-    def __init__(self, device: str, clock: Clock) -> None:
-        self._device = device
-        self._clock = clock
+    def __init__(self, polarity: int = 0) -> None:
+        self._polarity = polarity
         self._rest = b""
         self._port: Port | None = None
-        self._process = subprocess.Popen(  # noqa: S603 - our own program
-            [runner(device), FIRMWARE],
+        self._process = subprocess.Popen(
+            [runner(), FIRMWARE],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -68,13 +64,8 @@ class SimavrBox:
     def port(self) -> Port:
         """Its serial port, opened on first use."""
         if self._port is None:
-            self._port = open_box(self.name, self._device)
+            self._port = open_box(self.name, "lines")
         return self._port
-
-    @property
-    def pid(self) -> int:
-        """Number of its process."""
-        return self._process.pid
 
     def command(self, text: str) -> None:
         """Send a command to the simulator; ``runner.c`` lists them."""
@@ -93,11 +84,8 @@ class SimavrBox:
         """The start input goes low."""
         self.command("low")
 
-    def played(self, polarity: int) -> list[Edge]:
+    def played(self) -> list[Edge]:
         """What the outputs did since the start of the program that was just fired.
-
-        Args:
-            polarity: Outputs that are low when they are on.
 
         Returns:
             Ticks since the first edge, and what was on from then on; after a reset nothing is.
@@ -107,7 +95,7 @@ class SimavrBox:
         for cycle, levels in self.course():
             if first is None:
                 first = cycle
-            on = 0 if levels is None else (levels ^ polarity) & OUTPUTS
+            on = 0 if levels is None else (levels ^ self._polarity) & OUTPUTS
             if edges and cycle - edges[-1][0] < APART_CYCLES:
                 edges[-1] = (edges[-1][0], on)
             elif not edges or edges[-1][1] != on:
@@ -147,9 +135,8 @@ class SimavrBox:
 
     def _next_line(self) -> list[str]:
         """The words of the simulator's next line."""
-        words = wait_for(self._look, MAX_WAIT_S, self._clock)
-        if words is None:
-            raise DeviceError(self._device, "the simulated processor is silent; expected its outputs")
+        words = wait_for(self._look, MAX_WAIT_S, NeverStopped())
+        assert words is not None, "the simulated processor is silent"
         return words
 
     def _look(self, timeout_s: float) -> list[str] | None:
@@ -159,41 +146,21 @@ class SimavrBox:
             if not select.select([pipe], [], [], timeout_s)[0]:
                 return None
             came = os.read(pipe, 1 << 16)
-            if not came:
-                raise DeviceError(self._device, "the simulated processor died; expected it to run")
+            assert came, "the simulated processor died"
             self._rest += came
         line, _, self._rest = self._rest.partition(b"\n")
         return line.decode("ascii", "replace").split()
 
 
-def runner(device: str) -> Path:
+def runner() -> Path:
     """The compiled program that runs the firmware, from labseq's cache."""
     digest = hashlib.sha256(SOURCE.read_bytes()).hexdigest()[:24]
     program = cache_root() / "ttl" / digest / "runner"
     if not program.is_file():
-        compiler = shutil.which("cc") or shutil.which("gcc")
-        if compiler is None:
-            raise _missing(device, "there is no C compiler")
-        try:
-            _compile(compiler, program)
-        except subprocess.CalledProcessError as error:
-            first = next((line for line in error.stderr.splitlines() if "error" in line), error.stderr[:200])
-            raise _missing(device, first) from error
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise _missing(device, str(error)) from error
+        program.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=program.parent) as folder:
+            built = Path(folder) / "runner"
+            libraries = ("-lsimavr", "-lelf", "-lutil")
+            subprocess.run(["cc", "-O2", "-std=gnu11", SOURCE, "-o", built, *libraries], check=True)
+            built.replace(program)  # whole or not at all, also if another process does the same
     return program
-
-
-def _compile(compiler: str, program: Path) -> None:
-    program.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=program.parent) as folder:
-        made = Path(folder) / "runner"
-        command = [compiler, "-O2", "-std=gnu11", str(SOURCE), "-o", str(made), *_LIBRARIES]
-        subprocess.run(command, check=True, capture_output=True, text=True, timeout=COMPILE_TIMEOUT_S)  # noqa: S603 - a compiler, on our own file
-        os.replace(made, program)  # noqa: PTH105 - whole or not at all, also if another process does the same
-
-
-def _missing(device: str, reason: str) -> DeviceError:
-    text = f"the firmware cannot be simulated: {reason}"
-    hint = f"`apt-get install --no-install-recommends {PACKAGES}`, or set `simulated_by: python`"
-    return DeviceError(device, f"{text}; {hint}")
