@@ -134,7 +134,7 @@ def _acquisition() -> Iterable[str]:
     yield _enumeration("TriggerSelector", {"FrameStart": 0, "AcquisitionStart": 1})
     yield _enumeration("TriggerMode", {"Off": 0, "On": 1})
     yield _enumeration("TriggerSource", TRIGGERS)
-    yield _enumeration("TriggerActivation", {"RisingEdge": 0})
+    yield _enumeration("TriggerActivation", {"RisingEdge": 0, "FallingEdge": 1})
     yield _command("TriggerSoftware", "TriggerSoftware", 1)
     yield from _float("ExposureTime", "ExposureTime", "{0} * {1}", EXPOSURE_US)
     yield from _float("Gain", "Gain", "{0} * {1}", (0, 1_000_000), 1 / GAIN_STEP)

@@ -223,8 +223,8 @@ def test_a_frame_rate_that_was_set_before_does_not_limit_the_exposure() -> None:
 
 @needs_aravis
 def test_a_pulse_or_the_start_of_a_series_is_chosen_by_the_features_of_the_standard() -> None:
-    features = ("AcquisitionMode", "ExposureMode", "TriggerMode", "TriggerSource")
-    with rig(line_trigger="external_start", cycle_time="50 ms") as lab:
+    features = ("AcquisitionMode", "ExposureMode", "TriggerMode", "TriggerSource", "TriggerActivation")
+    with rig(line_trigger="external_start", cycle_time="50 ms", trigger_edge="falling") as lab:
         camera = lab.genicam
 
         def chosen(trigger: Trigger, selector: str) -> list[str]:
@@ -232,12 +232,18 @@ def test_a_pulse_or_the_start_of_a_series_is_chosen_by_the_features_of_the_stand
             camera.set("TriggerSelector", selector)
             return [camera.get(feature, str) for feature in features]
 
-        assert chosen("external_start", "AcquisitionStart") == ["MultiFrame", "Timed", "On", "Line1"]
+        assert chosen("external_start", "AcquisitionStart") == [
+            "MultiFrame",
+            "Timed",
+            "On",
+            "Line1",
+            "FallingEdge",
+        ]
         assert (camera.get("AcquisitionFrameCount", int), camera.get("AcquisitionFrameRate", float)) == (
             3,
             20.0,
         )
         assert chosen("external_start", "FrameStart")[2] == "Off"
-        assert chosen("bulb", "FrameStart") == ["Continuous", "TriggerWidth", "On", "Line1"]
+        assert chosen("bulb", "FrameStart") == ["Continuous", "TriggerWidth", "On", "Line1", "FallingEdge"]
         assert chosen("bulb", "AcquisitionStart")[2] == "Off"
-        assert chosen("software", "FrameStart") == ["Continuous", "Timed", "On", "Software"]
+        assert chosen("software", "FrameStart")[:4] == ["Continuous", "Timed", "On", "Software"]
