@@ -1,21 +1,14 @@
-"""`labseq serve-devices`: serves the devices of a profile, each on a port of its own.
-
-The first port is for control: connections and heartbeats, and requests to abort a call that blocks. Its
-thread makes no calls into drivers, so it always answers.
-"""
+"""`labseq serve-devices`: serves the devices of a profile, each on a port of its own."""
 
 from __future__ import annotations
 
 import os
-import platform
-import threading
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
-import labseq
 from labseq.assembly.plugin_choice import ChosenPlugin
 from labseq.assembly.profile import ResolvedProfile, resolve_profile
 from labseq.config.addresses import profile_overrides
@@ -32,32 +25,24 @@ from labseq.guard import StopFlag, stop_on_signals
 from labseq.messages import clean, format_error
 from labseq.plain import now
 from labseq.recording import clear_active
+from labseq.remote.control import Control
 from labseq.remote.drivers import DeviceEntry
-from labseq.remote.served import POLL_S, ServedDevice, why_ended
-from labseq.remote.sessions import CLOSED, Session
+from labseq.remote.known import KnownKeys
+from labseq.remote.served import POLL_S, ServedDevice
 from labseq.safety.devices import check_each_device
 from labseq.safety.locks import lock_devices
 from labseq.safety.safe import construct_hardware
 from labseq.sequencer.clock import RealClock
 from labseq.wire import (
-    LOST_S,
-    PROTOCOL,
-    Connections,
-    MessageError,
     find_keys,
     is_loopback,
     keys_root,
-    known_keys,
-    pack,
     parse_address,
-    report_error,
     require_packages,
     server_socket,
-    unpack,
 )
+from labseq.wire.keys import Keys
 
-MAX_SESSIONS: Final = 64
-"""Maximum number of connections at a time; a client that makes more is faulty."""
 END_S: Final = 10.0
 """Longest time for the devices to become safe when the server ends, in seconds."""
 
@@ -177,11 +162,14 @@ def _test(
 class Server:
     """The devices and their control.
 
+    Attributes:
+        devices: The devices that are served, by name.
+
     Args:
-        entries: The devices that are served.
+        entries: The devices.
         host: Address to listen on.
         port: The control's port; the devices have the next ones.
-        keys: Keys of this computer; None without keys.
+        own: Keys of this computer; None without keys.
         report: Receives what happens, for the operator.
     """
 
@@ -190,52 +178,38 @@ class Server:
         entries: Sequence[DeviceEntry],
         host: str,
         port: int,
-        keys: Any,
+        own: Keys | None,
         report: Callable[[str], object],
     ) -> None:
         import zmq
 
         self._report_to = report
-        self._keys = keys
-        self._known: Mapping[bytes, str] = known_keys(keys_root()) if keys is not None else {}
         self._zmq = zmq.Context()
-        self._auth: Any = None
-        self._ended = threading.Event()
-        self._failure: BaseException | None = None
-        self._key_failure = ""
         # closed at the end: files can then be opened to make devices safe, even if connections used up all
         self._spare = [os.open(os.devnull, os.O_RDONLY) for _ in range(32)]
+        self._keys = KnownKeys(own, self._report)
         self.devices: dict[str, ServedDevice] = {}
         try:
-            self._control = server_socket(self._zmq, host, port, keys)
+            socket = server_socket(self._zmq, host, port, own)
             for number, entry in enumerate(entries, 1):
-                socket = server_socket(self._zmq, host, port + number, keys)
-                self.devices[entry.name] = ServedDevice(entry, socket, self.is_known, self._report)
+                at_device = server_socket(self._zmq, host, port + number, own)
+                self.devices[entry.name] = ServedDevice(entry, at_device, self._keys.is_known, self._report)
         except ConfigError:
             self._zmq.destroy(linger=0)
             raise
-        self._ports = {name: port + number for number, name in enumerate(self.devices, 1)}
-        self._thread = threading.Thread(target=self._serve, name="labseq control", daemon=True)
-        self._host, self._port = host, port
+        self._control = Control(self.devices, port, self._keys, socket)
+        self._control_address = f"tcp://{host}:{port}"
 
     def start(self) -> None:
         """Begin to serve."""
-        if self._keys is not None:
-            from zmq.auth.thread import ThreadAuthenticator
-
-            self._auth = ThreadAuthenticator(self._zmq)
-            self._auth.start()
-            self._auth.configure_curve_callback("labseq", credentials_provider=_Credentials(self.is_known))
+        self._keys.start(self._zmq)
         for device in self.devices.values():
             device.start()
-        self._thread.start()
-        places = ", ".join(f"{name} at {port}" for name, port in self._ports.items())
-        self._report(f"serves {places}; control at tcp://{self._host}:{self._port}; Ctrl-C stops it")
-        if self._keys is not None:
-            names = (
-                ", ".join(sorted(self._known.values())) or f"none: put public keys into {keys_root()}/known"
-            )
-            self._report(f"known keys: {names}")
+        self._control.start()
+        places = ", ".join(f"{name} at {port}" for name, port in self._control.ports.items())
+        self._report(f"serves {places}; control at {self._control_address}; Ctrl-C stops it")
+        if self._keys.own is not None:
+            self._report(f"known keys: {self._keys.names}")
 
     def end(self) -> None:
         """Make all devices safe, at the same time, and end all threads."""
@@ -249,10 +223,8 @@ class Server:
                 device.rescue_stuck()
             time.sleep(POLL_S)
         late = [device.name for device in alive]
-        self._ended.set()
-        self._thread.join(1.0)
-        if self._auth is not None:
-            self._auth.stop()
+        self._control.end()
+        self._keys.end()
         for name in late:
             self._report(f"{name}: NOT SAFE: a call does not return")
         if not late:
@@ -264,177 +236,9 @@ class Server:
         Raises:
             DeviceError: It has ended.
         """
-        for failure in (self._failure, *(device.failure for device in self.devices.values())):
+        for failure in (self._control.failure, *(device.failure for device in self.devices.values())):
             if failure is not None:
                 raise DeviceError("serve-devices", format_error(failure)) from failure
 
-    def is_known(self, peer: str) -> bool:
-        """Whether a client's key is known, or none is needed."""
-        return self._keys is None or peer.encode() in self._known
-
     def _report(self, text: str) -> None:
         self._report_to(f"{now().astimezone():%H:%M:%S} {text}")
-
-    def _serve(self) -> None:
-        import zmq
-
-        self._control.set(zmq.RCVTIMEO, int(1e3 * POLL_S))
-        self._connections = Connections(self._control)
-        checked_s = keys_s = time.monotonic()
-        try:
-            while not self._ended.is_set():
-                try:
-                    frames = self._control.recv_multipart(copy=False)
-                except zmq.Again:
-                    frames = []
-                if frames:
-                    with suppress(zmq.ZMQError):  # the client is gone
-                        self._control.send_multipart([frames[0], *self._answer(frames)])
-                if (now_s := time.monotonic()) - keys_s > 0.2 and self._keys is not None:
-                    keys_s = now_s
-                    self._read_keys()
-                if now_s - checked_s > POLL_S:
-                    self._connections.limit()
-                    self._end_lost_sessions(now_s, now_s - checked_s, self._connections.ended())
-                    checked_s = time.monotonic()
-        except BaseException as error:  # noqa: BLE001 - the main thread ends the server
-            self._failure = error
-        finally:
-            self._connections.close()
-            self._control.close()
-
-    def _read_keys(self) -> None:
-        """Read the known keys again; if that fails, report it once and keep the previous ones."""
-        failure = ""
-        try:
-            self._known = known_keys(keys_root())
-        except Exception as error:  # noqa: BLE001 - whatever is wrong with them must not end the server
-            failure = (
-                f"the known keys cannot be read, and the previous ones stay valid: {format_error(error)}"
-            )
-        if failure and failure != self._key_failure:
-            self._report(failure)
-        self._key_failure = failure
-
-    def _end_lost_sessions(self, now_s: float, passed_s: float, ended: set[tuple[int, int]]) -> None:
-        """End the sessions of clients that have disappeared, or whose key was withdrawn."""
-        # after a long pause this computer stood still, and could not receive heartbeats
-        stood_still_s = passed_s if passed_s > LOST_S / 2 else 0.0
-        for device in self.devices.values():
-            for session in list(device.sessions.values()):
-                session.beat_s += stood_still_s
-                if session.connection in ended:
-                    device.end_session(session, "its process has ended")
-                elif now_s - session.beat_s > LOST_S:
-                    device.end_session(session, f"no heartbeat for {LOST_S:g} s")
-                elif not self.is_known(session.peer):
-                    device.end_session(session, "its key was withdrawn")
-            device.rescue_stuck()
-
-    def _answer(self, frames: list[Any]) -> list[Any]:
-        number = 0
-        try:
-            message = unpack([frame.buffer for frame in frames[1:]])
-            if type(message["n"]) is not int:
-                raise MessageError("it has no number")
-            number = message["n"]
-            return pack({"n": number, "value": self._value(message, frames[-1])})
-        except DeviceError as error:
-            return pack({"n": number, "error": report_error(error)})
-        except (MessageError, KeyError, TypeError, AttributeError) as error:
-            failure = DeviceError("server", f"the server cannot read a message: {format_error(error)}")
-            return pack({"n": number, "error": report_error(failure)})
-
-    def _value(self, message: Mapping[str, Any], frame: Any) -> Any:
-        """Do what a message asks for; its frame names the client's key and connection."""
-        import zmq
-
-        peer = str(frame.get("User-Id")) if self._keys is not None else ""
-        if not self.is_known(peer):
-            raise DeviceError("server", "the key was withdrawn")
-        if message["op"] == "hello":
-            return self._hello(message, peer, self._connections.named(frame.get(zmq.SRCFD)))
-        if message["op"] == "status":
-            return self._status()
-        handler = {"beat": self._beat, "bye": self._bye, "abort": self._abort}.get(message["op"])
-        if handler is None:
-            raise MessageError("its request is unknown")
-        return handler(message, *self._of(message, peer))
-
-    def _hello(self, message: Mapping[str, Any], peer: str, connection: tuple[int, int]) -> dict[str, Any]:
-        if message["protocol"] != PROTOCOL:
-            theirs = f"{clean(str(message['labseq']))} speaks protocol {clean(str(message['protocol']))}"
-            ours = f"labseq {labseq.__version__} of the server speaks {PROTOCOL}"
-            raise DeviceError("server", f"labseq {theirs}, and {ours}; update one of them")
-        device = self.devices.get(str(message["device"]))
-        if device is None:
-            text = f"there is no device '{clean(str(message['device']))}'; expected {one_of([*self.devices])}"
-            raise DeviceError("server", text)
-        if message["kind"] != device.kind:
-            used = clean(str(message["kind"]))
-            text = f"'{device.name}' is of the kind {device.kind}, and the profile uses it as {used}"
-            raise DeviceError("server", text)
-        if sum(len(other.sessions) for other in self.devices.values()) >= MAX_SESSIONS:
-            raise DeviceError("server", f"it already has {MAX_SESSIONS} connections")
-        name = self._known.get(peer.encode(), "this computer")
-        session = Session(peer, f"{name} ({clean(str(message['who']))})", connection)
-        device.sessions[session.token] = session
-        return {
-            "protocol": PROTOCOL,
-            "labseq": labseq.__version__,
-            "host": platform.node(),
-            "session": session.token,
-            "port": self._ports[device.name],
-        }
-
-    def _of(self, message: Mapping[str, Any], peer: str) -> tuple[ServedDevice, Session]:
-        """The device and the session that a message names.
-
-        Raises:
-            DeviceError: The session has ended.
-        """
-        token = message["session"]
-        for device in self.devices.values():
-            session = device.sessions.get(token)
-            if session is not None and session.peer == peer:
-                if session.ended:
-                    raise DeviceError(device.name, session.ended)
-                return device, session
-        ended = {key: why for device in self.devices.values() for key, why in device.ended.items()}
-        raise DeviceError("server", why_ended(ended, token))
-
-    def _beat(self, _message: Mapping[str, Any], device: ServedDevice, session: Session) -> dict[str, Any]:
-        session.beat_s = time.monotonic()
-        running = session.began_s is not None or device.is_busy
-        return {"number": session.number, "running": running, "rescue": session.rescue}
-
-    def _bye(self, _message: Mapping[str, Any], device: ServedDevice, session: Session) -> None:
-        device.end_session(session, CLOSED)
-
-    def _abort(self, message: Mapping[str, Any], _device: ServedDevice, session: Session) -> None:
-        if session.number == message["number"]:
-            session.abort_call()
-
-    def _status(self) -> list[dict[str, Any]]:
-        rows: list[dict[str, Any]] = []
-        for device in self.devices.values():
-            owner = device.owner
-            row = {"device": device.name, "owner": "", "call": "", "for_s": 0.0}
-            if owner is not None:
-                row["owner"] = owner.who
-                if (began_s := owner.began_s) is not None:
-                    row |= {"call": owner.call, "for_s": time.monotonic() - began_s}
-            rows.append(row)
-        return rows
-
-
-class _Credentials:
-    """The keys that the authenticator asks for."""
-
-    def __init__(self, is_known: Callable[[str], bool]) -> None:
-        self._is_known = is_known
-
-    def callback(self, domain: str, key: bytes) -> bool:
-        """Whether a client with this key may connect."""
-        del domain
-        return self._is_known(key.decode("ascii"))

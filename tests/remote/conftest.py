@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from labseq_remote.settings import RemoteSettings
 
-import labseq.remote.server
+import labseq.remote.control
 from labseq.remote.server import Server, Serving, serving
 
 PROFILE = """\
@@ -90,8 +90,8 @@ def _patient() -> Generator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("labseq.plugin.wire.LOST_S", 2.0)
-        patch.setattr(labseq.remote.server, "LOST_S", 2.0)
-        patch.setattr(labseq.remote.server, "MAX_SESSIONS", 10_000)
+        patch.setattr(labseq.remote.control, "LOST_S", 2.0)
+        patch.setattr(labseq.remote.control, "MAX_SESSIONS", 10_000)
         yield
 
 

@@ -27,7 +27,7 @@ from labseq_remote.drivers import (
 from labseq_remote.settings import RemoteSettings
 from labseq_virtual.devices import VirtualDevice
 
-import labseq.remote.server
+import labseq.remote.control
 import labseq.remote.sessions
 from labseq import wire
 from labseq.guard import StopFlag
@@ -175,7 +175,7 @@ def test_both_sides_notice_a_cut(server: Served, faulty: Proxy, monkeypatch: pyt
     devices["static_tweezers"].start()
     n_told = len(server.told)
     faulty.is_cut = True
-    monkeypatch.setattr(labseq.remote.server, "LOST_S", 0.3)
+    monkeypatch.setattr(labseq.remote.control, "LOST_S", 0.3)
     monkeypatch.setattr(wire_of_plugins, "LOST_S", 0.3)
     for name, device in devices.items():
         until(lambda name=name: any(f"{name}: the" in text for text in server.told[n_told:]))
@@ -229,7 +229,8 @@ def test_a_device_is_made_safe_beside_a_call_that_hangs(
     with instrument(server) as device:
         caller = threading.Thread(target=device.command, args=["open"], daemon=True)
         caller.start()
-        until(lambda: "command" in [row["call"] for row in server.server._status()])
+        sessions = server.server.devices["instrument"].sessions
+        until(lambda: any(session.call == "command" for session in [*sessions.values()]))
         device.safe_state()
         assert made_safe.is_set()
         released.set()
