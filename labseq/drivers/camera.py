@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, TypeAlias
+from typing import Annotated, Any, Final, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from pydantic.dataclasses import dataclass as settings
 
 from labseq.errors import DeviceError, DeviceTimeoutError, LimitError, TransientError, one_of
 from labseq.model import CameraFacts, Frame, Orientation, SensorMode
-from labseq.roles import Camera, Clock, Context, Simulation, Trigger
+from labseq.roles import Camera, Clock, Context, LineTrigger, Simulation, Trigger
 from labseq.settings import IN_SI, Duration, PositiveDuration, Temperature, setting_error
 from labseq.units import ZERO_CELSIUS_K, format_quantity
 
@@ -279,7 +279,7 @@ class CameraDriver(Camera):
             reason = "the next one was not triggered"
         elif series.trigger == "external_start" and n_read:
             reason = f"frame {n_read} is not ready"
-        elif series.trigger in ("external", "external_start", "bulb"):
+        elif series.trigger in get_args(LineTrigger):
             reason = f"frame {n_read} waits for its external trigger; check the line"
         else:
             reason = f"frame {n_read} is not ready"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Self, get_args
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from labseq.errors import ConfigError
 from labseq.model import CameraFacts, Flip, Orientation, SensorMode
-from labseq.roles import Context, Simulation
+from labseq.roles import Context, LineTrigger, Simulation, Trigger
 from labseq.settings import Duration, PositiveDuration, Settings
 
 
@@ -50,7 +50,7 @@ class CameraSettings(OrientationSettings):
         default=1, description="pixels of the sensor per pixel of a frame, along each axis"
     )
     max_exposure: PositiveDuration = Field(default=10.0, description="longest exposure")
-    line_trigger: Literal["external", "external_start", "bulb"] = Field(
+    line_trigger: LineTrigger = Field(
         default="external",
         description="what the line with `triggers: camera` does: `external`: each edge starts an exposure; "
         "`external_start`: one edge starts all exposures of a series, every `cycle_time`; `bulb`: the camera "
@@ -83,7 +83,7 @@ class CameraSettings(OrientationSettings):
         self,
         readout_s: float,
         frame_shape: tuple[int, int] | None,
-        triggers: tuple[str, ...] = ("software", "internal", "external", "external_start", "bulb"),
+        triggers: tuple[str, ...] = get_args(Trigger),
         **more: float,
     ) -> CameraFacts:
         """The facts about the camera, from its driver and from these settings.

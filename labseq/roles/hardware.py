@@ -19,12 +19,15 @@ from labseq.errors import ConfigError, DeviceError, Problem, one_of
 from labseq.messages import clean, did_you_mean
 from labseq.model import CameraFacts, Frame, LineProgram, LinesFacts, ToneProgram, TweezersFacts
 
-Trigger = Literal["software", "internal", "external", "external_start", "bulb"]
-"""What starts an exposure.
+LineTrigger = Literal["external", "external_start", "bulb"]
+"""How a line starts exposures.
 
 "external": an edge at the trigger input starts each one. "external_start": one edge starts the series, in
 which the camera times the exposures itself and ignores later edges. "bulb": the camera exposes as long as the
 input is on."""
+
+Trigger = Literal["software", "internal", LineTrigger]
+"""What starts an exposure: labseq, the camera's own clock, or a line."""
 
 
 @dataclass(frozen=True, slots=True)
