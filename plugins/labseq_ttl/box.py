@@ -221,6 +221,19 @@ class BoxState(NamedTuple):
     """Outputs that are low when they are on."""
 
 
+class LeaderState(NamedTuple):
+    """What the box knows of a leader."""
+
+    state: int
+    """``DEAF``, ``IDLE``, ``OWED`` or ``LATE``."""
+    n_go_signals: int
+    """Edges that were taken since the start."""
+    more_came: int
+    """Whether an edge was refused since the last answer."""
+    level: int
+    """Level of the start input."""
+
+
 class Box(Conversation):
     """The commands of a timing box on an open port."""
 
@@ -279,13 +292,14 @@ class Box(Conversation):
         (level,) = self._numbers(self.ask(f"lead {words}"), 1)
         return bool(level)
 
-    def answer_leader(self, *, is_ready: bool) -> list[int]:
+    def answer_leader(self, *, is_ready: bool) -> tuple[int, bool]:
         """Raise `ready` or `failed`; returns the state before, and whether an edge was refused meanwhile."""
-        return self._numbers(self.ask(f"answer {is_ready:d}"), 2)
+        state, more_came = self._numbers(self.ask(f"answer {is_ready:d}"), 2)
+        return state, bool(more_came)
 
-    def leader(self) -> list[int]:
-        """State towards the leader, edges accepted, whether one was refused, level of the start input."""
-        return self._numbers(self.ask("leader"), 4)
+    def leader(self) -> LeaderState:
+        """Read what it knows of a leader."""
+        return LeaderState(*self._numbers(self.ask("leader"), 4))
 
     def set_lines(self, mask: int) -> None:
         """Turn lines on and off at once."""

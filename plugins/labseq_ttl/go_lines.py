@@ -74,7 +74,7 @@ class GoLines(TtlLines):
         while not self._take(box):
             left_s = until_s - self._clock.now()
             if left_s <= 0:
-                raise self._no_go(timeout_s, is_high=bool(box.leader()[3]))
+                raise self._no_go(timeout_s, is_high=bool(box.leader().level))
             if (event := box.new_events(min(left_s, LOOK_S))) is not None:
                 self._handle(event)
         return ""
@@ -122,7 +122,7 @@ class GoLines(TtlLines):
 
     def _take(self, box: Box) -> bool:
         """Take a `go` that the box has accepted, unless its deadline has passed."""
-        state = box.leader()[0]
+        state = box.leader().state
         if state not in (OWED, LATE) or self._is_owed:
             return False
         if state == LATE:

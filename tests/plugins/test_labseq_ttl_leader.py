@@ -206,7 +206,7 @@ def test_go_comes_by_the_pin_and_is_answered(box: str) -> None:
     try:
         for state, n_go_signals in (("ready", 1), ("failed", 2)):
             assert made.lines.wait_for("go", 10.0) == ""
-            assert made.lines._opened().leader()[1] == n_go_signals
+            assert made.lines._opened().leader().n_go_signals == n_go_signals
             assert made.lines.report(state, {"shot": 0}) == state
             assert made.lines.report(state, {"shot": 0}) == ""  # it has its answer
             if box == "model":
@@ -293,7 +293,7 @@ def test_an_edge_while_labseq_is_busy_is_refused_and_reported(rig: Led) -> None:
     rig.box.start()
     rig.lines.report("ready", {})
     assert rig.lines.new_events()[-1] == "`go` came while labseq was busy, and was refused"
-    assert rig.lines._opened().leader()[1] == 1
+    assert rig.lines._opened().leader().n_go_signals == 1
 
 
 def test_an_unknown_signal_and_a_closed_box_are_refused() -> None:
