@@ -100,7 +100,7 @@ class Connection:
 
     def abandon(self) -> None:
         """End the heartbeats of a driver that is no longer used; the collector of garbage may not wait."""
-        self.life.end()
+        self.life.ended.set()
 
     def _close_sockets(self) -> None:
         """Called by the thread of the heartbeat, which uses a socket, after the connection was closed."""
