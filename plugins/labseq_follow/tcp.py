@@ -81,10 +81,7 @@ class TcpLink(Link):
                 events += self._receive()
             elif peer in self._newcomers:
                 events += self._receive_first_line(peer)
-        late_s = time.monotonic() - FIRST_LINE_S
-        for peer in [peer for peer, newcomer in self._newcomers.items() if newcomer.since_s < late_s]:
-            events += self._refuse(peer, f"it sent no line within {format_quantity(FIRST_LINE_S, 'time')}")
-        return events
+        return events + self._refuse_late_newcomers()
 
     def send(self, line: bytes) -> None:
         """Send a line; a control system that does not take it is disconnected, and never waited for."""
@@ -124,6 +121,12 @@ class TcpLink(Link):
         if len(self._newcomers) > MAX_NEWCOMERS:
             return self._refuse(next(iter(self._newcomers)), "too many connections wait")
         return []
+
+    def _refuse_late_newcomers(self) -> list[Event]:
+        late_s, events = time.monotonic() - FIRST_LINE_S, list[Event]()
+        for peer in [peer for peer, newcomer in self._newcomers.items() if newcomer.since_s < late_s]:
+            events += self._refuse(peer, f"it sent no line within {format_quantity(FIRST_LINE_S, 'time')}")
+        return events
 
     def _receive_first_line(self, peer: socket.socket) -> list[Event]:
         newcomer = self._newcomers[peer]
@@ -209,6 +212,13 @@ def _token_file() -> Path | None:
     return None if state is None else state / "leader.token"
 
 
+def _make_token(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)  # closed to others from the start
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(secrets.token_hex(16).encode() + b"\n")
+
+
 def _read_token(path: Path | None, device: str) -> bytes:
     """The token in a file, which is made if there is none.
 
@@ -219,10 +229,7 @@ def _read_token(path: Path | None, device: str) -> bytes:
         raise DeviceError(device, "this user has no folder for the token; set LABSEQ_STATE to one")
     try:
         if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            made = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with os.fdopen(made, "wb") as file:
-                file.write(secrets.token_hex(16).encode() + b"\n")
+            _make_token(path)
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):  # reading a pipe could block for ever
             raise OSError("it is not an ordinary file")

@@ -1,4 +1,4 @@
-"""Line programs as the edges of the box, and which programs the box stores."""
+"""Line programs as the edges of the box."""
 
 from __future__ import annotations
 
@@ -36,17 +36,6 @@ def edges_of(program: LineProgram, specs: Sequence[LineSpec], device: str) -> tu
     if SHORTEST <= end <= LONGEST:
         steps, masks = [*steps, int(end)], [*masks, masks[-1]]
     return tuple(zip(steps, masks, strict=True))
-
-
-def as_played(edges: Sequence[Edge], program: LineProgram, specs: Sequence[LineSpec]) -> LineProgram:
-    """The played edges as a program, in ticks since the first; those that changed nothing are left out."""
-    ours = sum(1 << spec.channel for spec in specs)  # other outputs may belong to a leader
-    edges = [(tick, mask & ours) for tick, mask in edges]
-    changes = [edge for i, edge in enumerate(edges) if i == 0 or edge[1] != edges[i - 1][1]]
-    on = [[bool(mask >> spec.channel & 1) for spec in specs] for _, mask in changes]
-    t_s = np.array([tick for tick, _ in changes], np.float64) * TICK_S
-    states = np.array(on, np.bool_).reshape(len(changes), len(specs))
-    return LineProgram(program.kind, program.lines, t_s, states, program.begin_s, program.duration_s)
 
 
 def mask_of(row: Sequence[bool], specs: Sequence[LineSpec]) -> int:

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from labseq_ttl.lines import TtlLines
-from labseq_ttl.programs import MAX_EDGES, as_played, edges_of
+from labseq_ttl.programs import MAX_EDGES, edges_of
 from labseq_ttl.protocol import CHANNELS, SHORTEST, SLOTS, TICK_S, unframed
 from labseq_ttl.settings import TtlSettings
+from labseq_ttl_sim.access import as_played
 from pydantic import ValidationError
 
 from labseq import ConfigError, LineProgram, LineSpec, Run, Session
