@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any, Final, NoReturn
+from typing import Any, Final, NamedTuple, NoReturn
 
 from labseq.plugin import (
     ConfigError,
@@ -24,7 +24,7 @@ from labseq.plugin.lines import idle_program, off_program
 from labseq.plugin.messages import one_of
 from labseq_ttl.access import choose_box
 from labseq_ttl.box import Box, Identity, cause_text, late_error
-from labseq_ttl.programs import MAX_EDGES, edges_of, mask_of
+from labseq_ttl.programs import MAX_EDGES, Slots, edges_of, mask_of
 from labseq_ttl.protocol import (
     CHANNELS,
     EDGES,
@@ -32,7 +32,6 @@ from labseq_ttl.protocol import (
     OUTPUTS,
     SHORTEST,
     SHORTEST_S,
-    SLOTS,
     TICK_S,
     VERSION,
     Edge,
@@ -48,6 +47,15 @@ TEST_TICKS: Final = 200_000
 TEST_WAIT_S: Final = 15.0
 TOO_FAST: Final = 0.95
 """A self test that takes less than this part of its time fails. More is the computer's delay."""
+
+
+class Compiled(NamedTuple):
+    """The program that was compiled last."""
+
+    program: LineProgram
+    slot: int
+    """Where the box holds it."""
+    n_edges: int
 
 
 class TtlLines(Lines):
@@ -71,7 +79,7 @@ class TtlLines(Lines):
         self._box: Box | None = None
         self._identity = Identity(0, 0, "")
         self._heartbeat: Heartbeat | None = None
-        self._slot_of: dict[tuple[Edge, ...], int] = {}
+        self._slots = Slots()
         self._n_boots = self._n_runs = 0
         self._was_lost = False
         self._forget()
@@ -154,12 +162,12 @@ class TtlLines(Lines):
             raise DeviceError(self._name, text)
         edges = edges_of(program, self._specs, self._name)
         self._refuse_while_running("compiled")
-        slot = self._slot_of.pop(edges, None)
+        slot = self._slots.find(edges)
         if slot is None:
-            slot = self._free_slot()
+            slot = self._slots.free()
             box.put(slot, edges)
-        self._slot_of[edges] = slot  # the one used last comes last
-        self._compiled, self._is_armed = (program, slot, len(edges)), False
+            self._slots.fill(slot, edges)
+        self._compiled, self._is_armed = Compiled(program, slot, len(edges)), False
 
     def arm(self) -> None:
         """Prepare the program that was compiled last."""
@@ -167,8 +175,7 @@ class TtlLines(Lines):
         self._refuse_while_running("armed")
         if self._compiled is None:
             raise DeviceError(self._name, "armed, but nothing was compiled; call compile() first")
-        _, slot, n_edges = self._compiled
-        boots = box.arm(slot, n_edges)
+        boots = box.arm(self._compiled.slot, self._compiled.n_edges)
         if boots != self._n_boots:
             self._was_reset(boots)
         self._is_armed = True
@@ -179,7 +186,7 @@ class TtlLines(Lines):
         if not self._is_armed or self._compiled is None:
             raise DeviceError(self._name, "fired, but not armed; call arm() before each fire()")
         self._refuse_while_running("fired")
-        program = self._compiled[0]
+        program = self._compiled.program
         self._is_armed, self._is_running = False, True
         box.fire(external=self._settings.start == "external")
         self._end_s = self._clock.now() + program.duration_s
@@ -198,7 +205,7 @@ class TtlLines(Lines):
 
     def self_test(self) -> None:
         """Write a program, read it back, and play one that changes no line."""
-        box, slot = self._opened(), self._free_slot()
+        box, slot = self._opened(), self._slots.free()
         self._refuse_while_running("tested")
         self._compiled, self._is_armed = None, False
         written = bit_pattern()
@@ -235,7 +242,7 @@ class TtlLines(Lines):
     def _connect(self) -> None:
         """Open the port, check the box, turn all lines off, and set what stays the same."""
         self._forget()
-        self._slot_of.clear()
+        self._slots.clear()
         try:
             self._box = box = Box(self.access.connect(), self._name, self._clock, self.access.max_wait_s)
             self._identity = box.identify()
@@ -275,7 +282,7 @@ class TtlLines(Lines):
         self.access.disconnect()
 
     def _forget(self) -> None:
-        self._compiled: tuple[LineProgram, int, int] | None = None
+        self._compiled: Compiled | None = None
         self._is_armed = self._is_running = False
         self._end_s = -math.inf
 
@@ -283,12 +290,6 @@ class TtlLines(Lines):
         if self._box is None:
             raise DeviceError(self._name, "not open; call open() first")
         return self._box
-
-    def _free_slot(self) -> int:
-        """A slot for a new program, if need be that of the program that was not used for the longest time."""
-        if len(self._slot_of) < SLOTS:
-            return min({*range(SLOTS)} - {*self._slot_of.values()})
-        return self._slot_of.pop(next(iter(self._slot_of)))
 
     def _refuse_while_running(self, what: str) -> None:
         while (event := self._opened().new_events()) is not None:
@@ -337,7 +338,7 @@ class TtlLines(Lines):
 
     def _was_reset(self, n_boots: int, cause: int = 0) -> NoReturn:
         self._forget()
-        self._slot_of.clear()
+        self._slots.clear()
         self._n_boots, self._n_runs, self._was_lost = n_boots, 0, True
         text = f"the box was reset (reason: {cause_text(cause)}) and turned all lines off"
         raise DeviceError(self._name, f"{text}; check its supply and cable")

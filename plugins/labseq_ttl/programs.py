@@ -1,4 +1,4 @@
-"""Line programs as the edges of the box."""
+"""Line programs as the edges of the box, and which programs the box stores."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from labseq.plugin import LimitError, LineProgram, LineSpec, format_quantity
-from labseq_ttl.protocol import EDGES, LONGEST, SHORTEST, TICK_S, Edge
+from labseq_ttl.protocol import EDGES, LONGEST, SHORTEST, SLOTS, TICK_S, Edge
 
 MAX_EDGES: Final = EDGES - 1
 """Edges of a program; one more marks its end."""
@@ -36,6 +36,34 @@ def edges_of(program: LineProgram, specs: Sequence[LineSpec], device: str) -> tu
     if SHORTEST <= end <= LONGEST:
         steps, masks = [*steps, int(end)], [*masks, masks[-1]]
     return tuple(zip(steps, masks, strict=True))
+
+
+class Slots:
+    """The slots of the box, and the programs that they hold."""
+
+    def __init__(self) -> None:
+        self._slot_of: dict[tuple[Edge, ...], int] = {}  # the one used last comes last
+
+    def find(self, edges: tuple[Edge, ...]) -> int | None:
+        """The slot of a program, which is used now; None if no slot holds it."""
+        slot = self._slot_of.pop(edges, None)
+        if slot is not None:
+            self._slot_of[edges] = slot
+        return slot
+
+    def free(self) -> int:
+        """A slot for a new program, if need be that of the program that was not used for the longest time."""
+        if len(self._slot_of) < SLOTS:
+            return min({*range(SLOTS)} - {*self._slot_of.values()})
+        return self._slot_of.pop(next(iter(self._slot_of)))
+
+    def fill(self, slot: int, edges: tuple[Edge, ...]) -> None:
+        """A program was written to a slot."""
+        self._slot_of[edges] = slot
+
+    def clear(self) -> None:
+        """The box has lost them all."""
+        self._slot_of.clear()
 
 
 def mask_of(row: Sequence[bool], specs: Sequence[LineSpec]) -> int:
