@@ -58,8 +58,8 @@ class Proxy:
     def end(self) -> None:
         self._ended.set()
         for thread in self._threads:
-            thread.join(5.0)
-        self._context.destroy(linger=0)
+            thread.join()  # it closes its sockets; the context would wait for ever for one that is open
+        self._context.term()
 
     def _pass(self, port: int) -> None:
         front = self._context.socket(zmq.ROUTER)
@@ -68,26 +68,30 @@ class Proxy:
         late: dict[tuple[bytes, bool], Late] = {}
         poller = zmq.Poller()
         poller.register(front, zmq.POLLIN)
-        while not self._ended.is_set():
-            for socket, _ in poller.poll(20):
-                parts = socket.recv_multipart()
-                if self.is_cut:
-                    continue
-                if socket is front:
-                    client, *message = parts
-                    if client not in backs:
-                        backs[client] = self._context.socket(zmq.DEALER)
-                        backs[client].connect(f"tcp://127.0.0.1:{port}")
-                        poller.register(backs[client], zmq.POLLIN)
-                    fault = self.fault if b"call" in message[0] else lambda message: [message]
-                    if self._is_rough:
-                        fault = late.setdefault((client, True), Late())
-                    for one in fault(message):
-                        backs[client].send_multipart(one)
-                else:
-                    client = next(name for name, back in backs.items() if back is socket)
-                    fault = late.setdefault((client, False), Late()) if self._is_rough else self.reply_fault
-                    for one in fault(parts):
-                        front.send_multipart([client, *one])
-        for socket in (front, *backs.values()):
-            socket.close(linger=0)
+        try:
+            while not self._ended.is_set():
+                for socket, _ in poller.poll(20):
+                    parts = socket.recv_multipart()
+                    if self.is_cut or self._ended.is_set():
+                        continue
+                    if socket is front:
+                        client, *message = parts
+                        if client not in backs:
+                            backs[client] = self._context.socket(zmq.DEALER)
+                            backs[client].connect(f"tcp://127.0.0.1:{port}")
+                            poller.register(backs[client], zmq.POLLIN)
+                        fault = self.fault if b"call" in message[0] else lambda message: [message]
+                        if self._is_rough:
+                            fault = late.setdefault((client, True), Late())
+                        for one in fault(message):
+                            backs[client].send_multipart(one)
+                    else:
+                        client = next(name for name, back in backs.items() if back is socket)
+                        fault = (
+                            late.setdefault((client, False), Late()) if self._is_rough else self.reply_fault
+                        )
+                        for one in fault(parts):
+                            front.send_multipart([client, *one])
+        finally:
+            for socket in (front, *backs.values()):
+                socket.close(linger=0)
