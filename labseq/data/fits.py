@@ -74,16 +74,16 @@ def readable(value: float, unit: str) -> tuple[str, float]:
     numerator, _, denominator = unit.partition("/")
     factor = 0.01 if numerator == "%" else 1.0
     base, _, power = denominator.partition("^")
-    # of the prefixes, the one that gives a number close to 10
     sizes = {
         f"{numerator}/{denominator.replace(base, one)}": factor / size ** int(power or 1)
         for one, size in UNITS.get(dimension_of(base) if base else "", {}).items()
         if one not in ("min", "h")
     }
-    best = (
-        min(sizes, key=lambda one: abs(math.log10(abs(value) / sizes[one]) - 1)) if value and sizes else unit
-    )
-    return best, sizes.get(best, factor)
+    if not sizes or not value:
+        return unit, factor
+    # the smallest number that is not below 1
+    best = min(sizes, key=lambda one: (abs(value) < sizes[one], abs(math.log10(abs(value) / sizes[one]))))
+    return best, sizes[best]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -249,6 +249,10 @@ class Run:
             free: Parameters to fit that the model fixes otherwise.
             along: Scanned address to fit along; by default the first.
 
+        Returns:
+            ``parameters`` (name -> ``value``, ``error``, which is 0 if it was fixed, and ``unit``, SI),
+            ``reduced_chi_square``, ``at(x)``, ``residuals``, and the points: ``x``, ``y``, ``errors``.
+
         Raises:
             ConfigError: There is no such quantity or model, or the points do not determine the parameters.
 
@@ -276,7 +280,11 @@ class Run:
     ) -> list[FitAt]:
         """Fit a quantity along one axis of a scan, at each combination of the values of the others.
 
-        Arguments and errors are those of :meth:`fit`; where some of the fits fail, the results say why.
+        Arguments and errors are those of :meth:`fit`.
+
+        Returns:
+            For each combination its ``values`` by address, and the ``fit``; where it failed, None and the
+            ``problem``.
         """
         from labseq.data.scanned import FitRequest, Scanned, fits_along, scanned
 
