@@ -185,7 +185,11 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
         if all(math.isnan(mean.value) for mean in means):
             raise ConfigError(Problem(f"no shot has a value of '{quantity.name}'", clean(run.path.name)))
     fit = request.fit
-    fits = () if fit is None else tuple(fits_along(run, scan, quantity, fit) for quantity in quantities)
+    fits = (
+        ()
+        if fit is None
+        else tuple(fits_along(run, scan, quantity, means, fit) for quantity, means in values)
+    )
     return ScanReport(scan, values, fits)
 
 

@@ -291,7 +291,8 @@ class Run:
         run = self.select(*where)
         given = {**(fixed or {}), **dict.fromkeys(free, "free")}
         scan = scanned(run) or Scanned((), (), ())
-        return fits_along(run, scan, run.quantity(quantity), FitRequest(model, given, along))
+        found = run.quantity(quantity)
+        return fits_along(run, scan, found, scan.over(found), FitRequest(model, given, along))
 
     def summary(self) -> dict[str, Any]:
         """The main results of the run, JSON-ready; None for a missing number."""

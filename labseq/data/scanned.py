@@ -183,14 +183,22 @@ class FitAt:
         return {"at": dict(self.values), **result}
 
 
-def fits_along(run: Run, scan: Scanned, quantity: Quantity, request: FitRequest) -> list[FitAt]:
+def fits_along(
+    run: Run, scan: Scanned, quantity: Quantity, means: Sequence[Estimated], request: FitRequest
+) -> list[FitAt]:
     """Fit a quantity along one axis, at each combination of the values of the others.
+
+    Args:
+        run: The run.
+        scan: The points of its scan.
+        quantity: The quantity.
+        means: Its mean at each point, see :meth:`Scanned.over`.
+        request: What to fit.
 
     Raises:
         ConfigError: There is no such axis, or no fit can be made.
     """
     i_along = _axis_number(scan, request.along)
-    means = scan.over(quantity)
     groups: dict[tuple[int, ...], list[int]] = {}
     for i, place in enumerate(scan.places):
         groups.setdefault((*place[:i_along], *place[i_along + 1 :]), []).append(i)
