@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from labseq.assembly.measures import make_measures
 from labseq.assembly.options import DryRun, Options
 from labseq.assembly.plugin_choice import (
     ChosenPlugin,
@@ -189,7 +190,9 @@ def _assembled(
         objects["planner"] = resolve(hardware.host, document, "planner", sequence.planner)
     steps, step_dumps = make_steps(hardware, document, sequence, problems)
     analyses, results = make_analyses(hardware, document, sequence, problems)
-    policy = make_policy(document, sequence, steps, results, problems)
+    target = objects.get("target")
+    policy = make_policy(document, sequence, steps, results, target, problems)
+    measures = make_measures(document, sequence, steps, target, results, problems)
     scanned: ScanPoints | None = None
     search: Search | None = None
     try:
@@ -200,13 +203,14 @@ def _assembled(
 
             scanned = ScanPoints(scan.bound(hardware.document), document, sequence, hardware)
             scanned.check(problems)
-            search = make_search(scanned, steps, results, problems)
+            search = make_search(scanned, steps, results, objects["target"], problems)
         problems.raise_any()
     except ConfigError as error:
         raise _explained(error, scan) from None
     target, planner = objects["target"], objects["planner"]
     resolved = {
-        **sequence.model_dump(mode="json", exclude={"shot", "target", "planner", "scan"}),
+        **sequence.model_dump(mode="json", exclude={"shot", "target", "planner", "scan", "measure"}),
+        "measure": measures,
         "target": objects["target_dump"],
         "planner": planner.dump(),
         "shot": with_policies(document, sequence, step_dumps),
@@ -337,6 +341,7 @@ def make_policy(
     sequence: SequenceSpec,
     steps: Sequence[tuple[str, Step]],
     results: Collection[str],
+    target: TargetPattern | None,
     problems: ProblemCollector,
 ) -> RunPolicy:
     """The policies of a run and its steps."""
@@ -355,7 +360,7 @@ def make_policy(
     if settings.checks:
         from labseq.assembly.quantities import check_checks  # loads what a run without checks does not need
 
-        check_checks(document, sequence, steps if is_whole else None, results, problems)
+        check_checks(document, sequence, steps if is_whole else None, results, target, problems)
     return RunPolicy(sequence.attempts, settings.when_exhausted, otherwise, tuple(policies))
 
 

@@ -8,9 +8,11 @@ from typing import Final
 from labseq.config.document import Document
 from labseq.config.sequence import SequenceSpec
 from labseq.data.columns import QUANTITIES
-from labseq.data.quantities import OF_IMAGES, quantity_problem, split_name
+from labseq.data.quantities import quantity_problem
 from labseq.errors import Loc, ProblemCollector
 from labseq.messages import clean, did_you_mean, listing
+from labseq.model import TargetPattern
+from labseq.model.image_quantities import OF_IMAGES, parse_name
 from labseq.model.records import unique_names
 from labseq.recording.results import PREFIX
 from labseq.roles import Step
@@ -30,6 +32,7 @@ def check_quantity(
     purpose: str,
     steps: Sequence[tuple[str, Step]] | None,
     results: Collection[str],
+    target: TargetPattern | None,
 ) -> None:
     """Check that the shots of a sequence can have a quantity.
 
@@ -39,6 +42,7 @@ def check_quantity(
         steps: The steps of a shot, or None if some have errors.
         results: Names of the results of its analyses, "analysis.NAME.KEY"; "analysis.NAME." if its keys are
             not known.
+        target: The target; None if it has errors.
 
     Raises:
         ConfigError: No shot can have it.
@@ -47,11 +51,11 @@ def check_quantity(
     images = [image for image, (_, step) in zip(names, steps or (), strict=True) if step.takes_image]
     unforeseen = [result for result in results if result.endswith(".")]
     known = [*QUANTITIES, *(result for result in results if result not in unforeseen)]
-    problem = quantity_problem(name, known, images, (*_UNFORESEEN, *unforeseen))
+    problem = quantity_problem(name, known, images, target, (*_UNFORESEEN, *unforeseen))
     if problem is not None:
         what, expected, hint = problem
         raise document.error(place, f"{what} {purpose}", expected, _analysis_hint(name, results) or hint)
-    needs_image = name in _JUDGED or split_name(name)[0] in OF_IMAGES
+    needs_image = name in _JUDGED or parse_name(name).kind in OF_IMAGES
     if needs_image and steps is not None and not images:
         what = f"no shot has a {name}: it takes no image"
         raise document.error(place, what, "an 'image' step in the shot, or another quantity")
@@ -83,13 +87,14 @@ def check_checks(
     sequence: SequenceSpec,
     steps: Sequence[tuple[str, Step]] | None,
     results: Collection[str],
+    target: TargetPattern | None,
     problems: ProblemCollector,
 ) -> None:
     """Check the checks of a sequence; arguments as for :func:`check_quantity`."""
     for number, check in enumerate(sequence.policy.checks):
         place = "policy", "checks", number
         with problems:
-            check_quantity(document, (*place, "value"), check.value, "to check", steps, results)
+            check_quantity(document, (*place, "value"), check.value, "to check", steps, results, target)
         if check.then == "skip_point" and sequence.scan is None:
             what = "there is no scan whose points could be skipped"
             problems.add(document.error((*place, "then"), what, "'warn' or 'stop'"))

@@ -13,7 +13,7 @@ from labseq.config.scan import AdaptiveScan
 from labseq.errors import ConfigError, DeviceError, ProblemCollector
 from labseq.guard import Guard, StopFlag
 from labseq.messages import clean
-from labseq.model import ScanRange, ScanSpace, VisitedPoint
+from labseq.model import ScanRange, ScanSpace, TargetPattern, VisitedPoint
 from labseq.recording.run_file import SCANNER
 from labseq.units import written
 
@@ -159,6 +159,7 @@ def make_search(
     corners: ScanPoints,
     steps: Sequence[tuple[str, Step]],
     results: Collection[str],
+    target: TargetPattern,
     problems: ProblemCollector,
 ) -> Search | None:
     """Choose and check the scanner of a scan; None if its points are listed, or if there is a problem.
@@ -168,13 +169,14 @@ def make_search(
     Args:
         corners: The points of the scan, checked: of an adaptive scan, the corners of its ranges.
         results: Names of the results of the analyses, see :func:`labseq.assembly.quantities.check_quantity`.
+        target: The target of the sequence.
     """
     scan = corners.scan
     if not isinstance(scan, AdaptiveScan) or problems.problems:
         return None
     document, choice = corners.document, scan.choice
     with problems:
-        check_quantity(document, choice.aim, choice.quantity, TO_OPTIMISE, steps, results)
+        check_quantity(document, choice.aim, choice.quantity, TO_OPTIMISE, steps, results, target)
     chosen: ChosenPlugin | None = None
     with problems:
         chosen = resolve(corners.hardware.host, document, "scanner", choice)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlias, cast
 
-from pydantic import AfterValidator, Field, PlainValidator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, model_validator
 
 from labseq.config.addresses import Override
 from labseq.config.document import Document, FallbackValues, StoredText, check_kind, load_checked
@@ -61,6 +61,41 @@ class CheckSettings(Settings):
             what = f"at_least is {self.at_least:g}, but at_most is {self.at_most:g}"
             raise setting_error(what, "limits with something between them", at=("at_least",))
         return self
+
+
+class MeasureSettings(Settings):
+    """A quantity that the run is about, and how it depends on the scanned value."""
+
+    value: Text = Field(
+        description="name of a quantity: `survival:before,after@target`, `filling`, "
+        "`reading.laser.power_w`, `analysis.survival.survival`"
+    )
+    fit: Text | None = Field(
+        default=None, description="model that is fitted to it against the scanned value: `exponential`"
+    )
+    report: Text | None = Field(
+        default=None, description="parameter of the fit that is the result of the run; by default its first"
+    )
+    parameters: Annotated[dict[str, bool | int | float | str], empty_is({})] = Field(
+        default={}, description="parameters of the fit that are fixed: `{offset: 0}`; `free` frees one"
+    )
+
+    @model_validator(mode="after")
+    def _has_a_fit(self) -> Self:
+        for key in ("report", "parameters"):
+            if self.fit is None and getattr(self, key):
+                raise setting_error(f"'{key}' without a fit", "'fit' as well", at=(key,), key=True)
+        return self
+
+
+def _as_mapping(value: Any) -> Any:
+    return {"value": value} if isinstance(value, str) else value
+
+
+Measures: TypeAlias = Annotated[
+    tuple[Annotated[MeasureSettings, BeforeValidator(_as_mapping)], ...] | None, Field(min_length=1)
+]
+"""What a run measures, the most important first; None to choose it by the steps."""
 
 
 class PolicySettings(Settings):
@@ -202,6 +237,11 @@ class SequenceSpec(Settings):
     )
     repeats: int = Field(default=1, ge=1, le=1_000_000, description="shots of each point of the scan")
     order: ScanOrder = Field(default="sequential", description="order of the scan's shots")
+    measure: Measures = Field(
+        default=None,
+        description="the quantities that the run is about, the most important first; "
+        "by default `filling` and `defect_free` with a target, else the survival between the last two images",
+    )
     variables: Variables = Field(default={}, description="numbers and quantities that expressions refer to")
     analysis: Analyses = Field(default=(), description="analyses of each shot, in parallel to the run")
     shot: Steps = Field(description="the steps of a shot")

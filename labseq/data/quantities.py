@@ -12,14 +12,23 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from labseq.data.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, columns_of, quantities_in
 from labseq.data.shot import Shot
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, closest
-from labseq.model import ImageRecord, TargetPattern, follow_atoms
+from labseq.model import TargetPattern
 from labseq.model.estimate import Estimated, Rate, mean
+from labseq.model.image_quantities import (
+    NO_VALUE,
+    OF_IMAGES,
+    SITES,
+    Events,
+    events_of,
+    find_image,
+    mask_of,
+    parse_name,
+)
+from labseq.recording.index import IndexRow
 from labseq.recording.results import PREFIX, result_columns
 from labseq.recording.schema import unit_of
 from labseq.units import parse_any
@@ -27,8 +36,6 @@ from labseq.units import parse_any
 if TYPE_CHECKING:
     from labseq.data.reader import Run
 
-NO_VALUE: Final = (math.nan, 0.0)
-"""Events and trials of a shot without a value."""
 MAX_SHOTS_READ: Final = 20
 """Maximum number of shots in which the names of images are looked up."""
 
@@ -50,7 +57,7 @@ class Quantity:
     unit: str
     is_rate: bool
     is_fraction: bool
-    events_of: Callable[[Shot], tuple[float, float]]
+    events_of: Callable[[Shot], Events]
 
     def of_shot(self, shot: Shot) -> float:
         """The value of a shot; nan if it has none, or its file cannot be read."""
@@ -64,103 +71,11 @@ class Quantity:
             return Rate(round(sum(n for n, _ in events)), round(sum(n for _, n in events)))
         return mean([n / n_trials for n, n_trials in events])
 
-    def _events(self, shot: Shot) -> tuple[float, float]:
+    def _events(self, shot: Shot) -> Events:
         try:
             return self.events_of(shot)
         except RecordingError:
             return NO_VALUE
-
-
-def _image(shot: Shot, name: str, default: int) -> ImageRecord | None:
-    """The image of a name, or of an index counted from 0."""
-    images = shot.images
-    if not name:
-        return images[default] if images else None
-    if name.isdecimal():
-        return images[int(name)] if int(name) < len(images) else None
-    return next((image for image in images if image.name == name), None)
-
-
-def _survival(shot: Shot, _: TargetPattern, before: str = "", after: str = "") -> tuple[float, float]:
-    first, last = _image(shot, before, 0), _image(shot, after, -1)
-    if first is None or last is None or first.t_start_s >= last.t_start_s:
-        return NO_VALUE
-    # an image is taken at the end of its cycle, so that the cycle of the first image does not count
-    start, end = (first.step, first.cycle), (last.step, last.cycle)
-    cycles = (cycle for cycle in shot.cycles if start < (cycle.step, cycle.cycle) <= end)
-    expected = np.logical_or(*follow_atoms(first.occupancy, cycles))
-    return int(np.sum(expected & last.occupancy)), int(np.sum(expected))
-
-
-def _loading(shot: Shot, _: TargetPattern, name: str = "") -> tuple[float, float]:
-    image = _image(shot, name, 0)
-    return NO_VALUE if image is None else (float(image.occupancy.mean()), 1)
-
-
-def _defects(shot: Shot, target: TargetPattern, name: str) -> tuple[int, int] | None:
-    """Defects and surplus atoms on an image; without a name on the last one, from the index."""
-    if name:
-        image = _image(shot, name, -1)
-        return image and (target.n_defects(image.occupancy), target.n_surplus(image.occupancy))
-    images = shot.row.images
-    return (images.n_defects[-1], images.n_surplus[-1]) if len(images) else None
-
-
-def _filling(shot: Shot, target: TargetPattern, name: str = "") -> tuple[float, float]:
-    if not name and not math.isnan(shot.filling_fraction):  # in the index: the shot's file is not read
-        return shot.filling_fraction, 1
-    defects = _defects(shot, target, name) if target.n_atoms else None
-    return NO_VALUE if defects is None else (1 - defects[0] / target.n_atoms, 1)
-
-
-def _defect_free(shot: Shot, target: TargetPattern, name: str = "") -> tuple[float, float]:
-    if not name and not math.isnan(shot.filling_fraction):
-        return shot.success, 1
-    defects = None if target.is_none else _defects(shot, target, name)
-    return NO_VALUE if defects is None else (not any(defects), 1)
-
-
-@dataclass(frozen=True, slots=True)
-class ImageQuantity:
-    """A quantity of one or two images.
-
-    Attributes:
-        about: Its description.
-        n_images: Number of images that its name may give.
-        is_rate: See :class:`Quantity`.
-        events_of: Its value, see :class:`Quantity`; takes a shot, the target and the names of the images.
-    """
-
-    about: str
-    n_images: int
-    is_rate: bool
-    events_of: Callable[..., tuple[float, float]]
-
-
-OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
-    "survival": ImageQuantity(
-        "atoms of an image that a later one still shows, at the sites to which they were moved; "
-        "by default from the first image to the last",
-        2,
-        True,
-        _survival,
-    ),
-    "filling": ImageQuantity("share of the target's sites with an atom; last image", 1, False, _filling),
-    "defect_free": ImageQuantity("whether the target is met; last image", 1, True, _defect_free),
-    "loading": ImageQuantity("share of all sites with an atom; first image", 1, False, _loading),
-}
-"""Quantities that follow from images; a name may give the images: "filling:before"."""
-
-
-def split_name(name: str) -> tuple[str, tuple[str, ...]]:
-    """Split the name of a quantity into its kind and its images.
-
-    Example:
-        >>> split_name("survival:before,after"), split_name("stage.plan_s")
-        (('survival', ('before', 'after')), ('stage.plan_s', ()))
-    """
-    kind, colon, images = name.partition(":")
-    return (kind, tuple(image.strip() for image in images.split(","))) if colon else (name, ())
 
 
 def make_quantity(
@@ -173,25 +88,43 @@ def make_quantity(
         target: The target of the run.
         results: The results of analyses: name -> shot -> value.
     """
-    kind, images = split_name(name)
+    kind = parse_name(name).kind
     if kind in OF_IMAGES:
-        quantity = OF_IMAGES[kind]
-        return Quantity(
-            name, "", quantity.is_rate, True, lambda shot: quantity.events_of(shot, target, *images)
-        )
+
+        def of_images(shot: Shot) -> Events:
+            known = _in_index(name, shot.row, target)
+            return events_of(name, shot, target) if known is None else known
+
+        return Quantity(name, "", OF_IMAGES[kind].is_rate, True, of_images)
     values = (results or {}).get(name)
     # results that are true or false are counted as events
     is_rate = name == "success" or (values is not None and {*map(type, values.values())} == {bool})
 
-    def events_of(shot: Shot) -> tuple[float, float]:
+    def of_columns(shot: Shot) -> Events:
         value = quantities_in(shot.row).get(name) if values is None else values.get(shot.index)
         return NO_VALUE if value is None else (float(value), 1)
 
-    return Quantity(name, unit_of(name), is_rate, is_rate or name in FRACTIONS, events_of)
+    return Quantity(name, unit_of(name), is_rate, is_rate or name in FRACTIONS, of_columns)
+
+
+def _in_index(name: str, row: IndexRow, target: TargetPattern) -> Events | None:
+    """A quantity of images as far as the index has it: the shot's file is then not read."""
+    images = row.images
+    if name in row.measured or not len(images) or target.is_none:
+        return row.measured.get(name)
+    if name == "filling" and target.n_atoms:
+        return 1 - images.n_defects[-1] / target.n_atoms, 1
+    if name == "defect_free":
+        return float(not images.n_defects[-1] and not images.n_surplus[-1]), 1
+    return None
 
 
 def quantity_problem(
-    name: str, columns: Collection[str], images: Collection[str], open_prefixes: tuple[str, ...] = ()
+    name: str,
+    columns: Collection[str],
+    images: Collection[str],
+    target: TargetPattern | None,
+    open_prefixes: tuple[str, ...] = (),
 ) -> tuple[str, str, str] | None:
     """The problem with the name of a quantity, what was expected and a hint; None if it is right.
 
@@ -199,9 +132,10 @@ def quantity_problem(
         name: The name.
         columns: The known names of quantities without images.
         images: The known names of images; none to accept any.
+        target: The target of the run; None if it is not known.
         open_prefixes: Prefixes of names that are not known beforehand.
     """
-    kind, named = split_name(name)
+    kind, named, sites = parse_name(name)
     if kind not in OF_IMAGES:
         if not named and (name in columns or name.startswith(open_prefixes or ("\0",))):
             return None
@@ -219,12 +153,24 @@ def quantity_problem(
             near = closest(image, images)
             problem = f"there is no image '{clean(image)}' for '{clean(name)}'"
             return problem, f"one of {', '.join(images)}", f"did you mean '{near}'?" if near else ""
+    return None if target is None else _sites_problem(name, sites, target)
+
+
+def _sites_problem(name: str, sites: str, target: TargetPattern) -> tuple[str, str, str] | None:
+    if "@" in name and not sites:
+        return f"'{clean(name)}' names no sites after the '@'", SITES, ""
+    try:
+        mask = mask_of(sites, target)
+    except ValueError as error:
+        return clean(str(error)), SITES, ""
+    if parse_name(name).kind == "filling" and not target.is_none and not (mask & target.fill).any():
+        return f"no site of '{clean(name)}' is one that the target fills", SITES, ""
     return None
 
 
 def description_of(name: str) -> str:
     """The description of a quantity whose name has been checked."""
-    kind = split_name(name)[0]
+    kind = parse_name(name).kind
     if kind in OF_IMAGES:
         return OF_IMAGES[kind].about
     of_group = next((about for prefix, about in GROUPS.items() if name.startswith(prefix)), RESULT)
@@ -263,8 +209,8 @@ def find_quantity(run: Run, name: str) -> Quantity:
     Raises:
         ConfigError: The run has no such quantity; lists those that it has.
     """
-    images = image_names(run) if split_name(name)[1] else []
-    problem = quantity_problem(name, column_names(run), images)
+    images = image_names(run) if parse_name(name).images else []
+    problem = quantity_problem(name, column_names(run), images, run.target)
     if problem is not None:
         message, expected, hint = problem
         raise ConfigError(Problem(message, clean(run.path.name), expected=expected, hint=hint))
@@ -286,13 +232,13 @@ def steps_that_load(run: Run) -> frozenset[int]:
 
 def _check_no_load(run: Run, name: str) -> None:
     """Refuse survival between images with a loading between them, as far as the run's record tells."""
-    kind, images = split_name(name)
+    kind, images, _ = parse_name(name)
     loads = steps_that_load(run)
     if kind != "survival" or not loads or not run.shots:
         return
     try:
         first, last = (
-            _image(run.shots[0], image, at) for image, at in zip(images or ("", ""), (0, -1), strict=True)
+            find_image(run.shots[0], image, at) for image, at in zip(images or ("", ""), (0, -1), strict=True)
         )
     except RecordingError:
         return

@@ -26,6 +26,7 @@ from labseq.files import (
     sync_folder,
     write_file,
 )
+from labseq.model.image_quantities import measured_in
 from labseq.plain import dumps, now_utc, parse_object
 from labseq.processes import Lock, Process
 from labseq.recording import folders
@@ -381,7 +382,14 @@ class _Check:
                 pass
             n_bytes, sha256 = _size_and_hash(path)
             with damage_reported(path):
-                row = row_of_record(content.record, content.target, file=file, sha256=sha256, n_bytes=n_bytes)
+                row = row_of_record(
+                    content.record,
+                    content.target,
+                    file=file,
+                    sha256=sha256,
+                    n_bytes=n_bytes,
+                    measured=measured_in(content.run["resolved"]),
+                )
         except OSError as error:
             self._add(f"cannot be read: {error.strerror}", path, _CHECK_PERMISSIONS)
             return None

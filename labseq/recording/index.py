@@ -20,6 +20,7 @@ import numpy as np
 from labseq.errors import RecordingError
 from labseq.files import NewLines
 from labseq.model import ShotRecord, TargetPattern
+from labseq.model.image_quantities import OF_IMAGES, Events, events_of, parse_name
 from labseq.model.records import STEP, ShotStatus
 from labseq.plain import to_plain
 from labseq.recording import schema
@@ -91,6 +92,8 @@ class IndexRow:
         images: Its images.
         cycles: Its rearrangement cycles.
         simulation: True values that a simulation reported, such as "lost.vacuum"; empty on real hardware.
+        measured: What the run measures, as far as images tell it: name -> events and trials; those of other
+            quantities are in the columns.
         file: The shot's file, from the run's folder.
         sha256: Checksum of the file.
         bytes: Size of the file.
@@ -118,6 +121,7 @@ class IndexRow:
     images: Images
     cycles: Cycles
     simulation: Mapping[str, float]
+    measured: Mapping[str, Events]
     file: str
     sha256: str
     bytes: int
@@ -140,11 +144,25 @@ class IndexRow:
 
 
 def row_of_record(
-    shot: ShotRecord, target: TargetPattern, *, file: str, sha256: str, n_bytes: int
+    shot: ShotRecord,
+    target: TargetPattern,
+    *,
+    file: str,
+    sha256: str,
+    n_bytes: int,
+    measured: Iterable[str] = (),
 ) -> IndexRow:
     """A shot as the index lists it: the same as when its line is read back.
 
     A scanner thus chooses the same points, whether the run was resumed or not.
+
+    Args:
+        shot: The shot.
+        target: The target of the run.
+        file: Its file, from the run's folder.
+        sha256: Checksum of that.
+        n_bytes: Size of that.
+        measured: The quantities that the run measures.
 
     Raises:
         RecordingError: The record contradicts itself.
@@ -170,6 +188,9 @@ def row_of_record(
             name.removeprefix(SIMULATION): float(value)
             for name, value in shot.readings.items()
             if name.startswith(SIMULATION) and isinstance(value, Real)
+        },
+        "measured": {
+            name: events_of(name, shot, target) for name in measured if parse_name(name).kind in OF_IMAGES
         },
         "file": file,
         "sha256": sha256,
@@ -229,6 +250,7 @@ def read_index(folder: Path) -> tuple[list[IndexRow], int]:
 def row_of_line(line: Mapping[str, Any]) -> IndexRow | None:
     """The row in a line of the index; None if the line is damaged."""
     try:
+        line = {"measured": {}, **line}  # those of earlier versions have none
         values: list[Any] = [read(line[name]) for name, read in _READ]
         return IndexRow(*values)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
@@ -268,6 +290,10 @@ def _floats_by_name(values: Mapping[str, Any]) -> Mapping[str, float]:
     return dict(zip(values, _floats(values.values()), strict=True))
 
 
+def _events_by_name(values: Mapping[str, Any]) -> Mapping[str, Events]:
+    return {name: (_float(n), _float(n_trials)) for name, (n, n_trials) in values.items()}
+
+
 def _table(kind: Callable[..., _T]) -> Callable[[Any], _T]:
     """Reads columns of equal length."""
     columns = [
@@ -302,6 +328,7 @@ _READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "images": _table(Images),
     "cycles": _table(Cycles),
     "simulation": _floats_by_name,
+    "measured": _events_by_name,
     "file": _file,
     "sha256": _of_type(str),
     "bytes": _integer,

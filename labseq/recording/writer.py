@@ -20,6 +20,7 @@ from labseq.errors import DeviceError, DeviceHungError, RecordingError, StopRequ
 from labseq.files import LineLog, explained, sync_folder, write_file
 from labseq.guard import Guard, StopFlag
 from labseq.model import RunRecord, ShotRecord
+from labseq.model.image_quantities import measured_in
 from labseq.model.records import RunStatus
 from labseq.plain import dumps, now_utc
 from labseq.recording import folders
@@ -178,7 +179,14 @@ class RunWriter:
         """
         data = self._encoder.encode(shot)
         file = self._free_name(shot.shot_index, shot.attempt, counts=shot.status == "complete")
-        row = row_of_record(shot, self.run.target, file=file, sha256="", n_bytes=data.nbytes)
+        row = row_of_record(
+            shot,
+            self.run.target,
+            file=file,
+            sha256="",
+            n_bytes=data.nbytes,
+            measured=measured_in(self.run.resolved),
+        )
         sha256 = SimpleQueue[str]()
         wait = self._on_disk(self._write_shot, row, data, sha256)
         sha256.put(hashlib.sha256(data).hexdigest())  # while the disk writes

@@ -15,7 +15,8 @@ from labseq.cli import main
 from labseq.data.fit_models import MODELS, RB87_U
 from labseq.data.fits import fit_points
 from labseq.data.points import scan_points
-from labseq.data.quantities import OF_IMAGES, select_shots
+from labseq.data.quantities import select_shots
+from labseq.model.image_quantities import OF_IMAGES
 from labseq.errors import ConfigError
 from labseq.model.estimate import Estimate, Estimated, Rate
 
