@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq.analysis.overview import RunPicture, scan_panels
-from labseq.analysis.scanned import DEFAULT, WITHOUT_TARGET
 from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, Point, recorded_runs
 from labseq.console.output import say
 from labseq.console.text import plural
 from labseq.data import Run, Shot
 from labseq.data.columns import quantities_in
 from labseq.data.points import ScanPoint
-from labseq.data.quantities import Quantity, description_of
+from labseq.data.quantities import WITH_TARGET, Quantity, description_of, measured_by
 from labseq.data.scanned import Scanned, make_axis
 from labseq.data.tables import check_installed
 from labseq.errors import ConfigError, Problem, RecordingError
@@ -84,7 +83,7 @@ def combined(campaign: Campaign, runs: Runs) -> xr.Dataset:
     """The results of a campaign on the grid of its points.
 
     Returns:
-        With a dimension for each axis: ``n_shots``, and mean filling and defect-free fraction with the ends
+        With a dimension for each axis: ``n_shots``, and the mean of what the runs measure with the ends
         of their 1 sigma intervals, ``filling_low`` and ``filling_high``. With the dimension ``repeat`` as
         well, if points have several shots: :data:`OF_SHOTS`. nan without a value. Coordinates are SI.
     """
@@ -95,14 +94,15 @@ def combined(campaign: Campaign, runs: Runs) -> xr.Dataset:
     shape, names = tuple(map(len, campaign.axes.values())), tuple(campaign.axes)
     shots = {point: _shots(same_point) for point, same_point in runs.items()}
     n_repeats = max(campaign.settings.repeats, *map(len, shots.values()))
-    means = {f"{name}{end}": np.full(shape, np.nan) for name in DEFAULT for end in ("", "_low", "_high")}
+    measured = measured_by(_first(runs)) if any(runs.values()) else WITH_TARGET
+    means = {f"{name}{end}": np.full(shape, np.nan) for name in measured for end in ("", "_low", "_high")}
     of_shots = {name: np.full((*shape, n_repeats), np.nan) for name in OF_SHOTS}
     n_shots = np.zeros(shape, np.int64)
     for point, same_point in runs.items():
         if not same_point:
             continue
         n_shots[point] = len(shots[point])
-        for name in DEFAULT:
+        for name in measured:
             estimate = same_point[0].quantity(name).over(shots[point])
             for end, value in zip(("", "_low", "_high"), (estimate.value, *estimate.interval), strict=True):
                 means[name + end][point] = value
@@ -168,7 +168,7 @@ def campaign_picture(folder: Path) -> RunPicture:
     shots = [_shots(runs[point]) for point in points]
     places = tuple(tuple(point[i] for i in varied) for point in points)
     scan = Scanned(axes, places, tuple(ScanPoint({}, {}, point_shots) for point_shots in shots))
-    names = WITHOUT_TARGET if _first(runs).target.is_none else DEFAULT
+    names = measured_by(_first(runs))
     rows = tuple(row for name in names if (row := scan_panels(scan, _over_runs(runs, name))))
     if not rows:
         raise ConfigError(Problem("the campaign has no shots to draw yet", visible(str(folder))))

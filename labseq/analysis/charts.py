@@ -97,54 +97,60 @@ def points_of(x: Sequence[float], values: Sequence[Estimated]) -> Floats:
     return np.array(rows, np.float64).reshape(-1, 4).T
 
 
-def trend(name: str, shots: Floats, values: Floats, *, is_rate: bool) -> Panel | None:
-    """A fraction for each shot, and its running mean with the error; None if no shot has a value.
+def trend(
+    name: str, shots: Floats, values: Floats, *, is_yes_or_no: bool, unit: str = "%", scale: float = 100.0
+) -> Panel | None:
+    """A quantity of each shot, and its running mean with the error; None if no shot has a value.
 
     Args:
         name: The quantity.
         shots: float64 (n,), indices of the shots.
-        values: float64 (n,), a fraction for each; nan if unknown.
-        is_rate: Whether each value is 0 or 1; the scale is then 0 to 100 %.
+        values: float64 (n,), a value for each, SI; nan if unknown.
+        is_yes_or_no: Whether each value is 0 or 1; the scale is then 0 to 100 %.
+        unit: Unit that the values are shown in.
+        scale: Factor to it.
     """
     has_value = np.isfinite(values)
     if not has_value.any():
         return None
     shots, values = shots[has_value], values[has_value]
-    window, running = running_mean(shots, values, is_rate=is_rate)
+    window, running = running_mean(shots, values, is_yes_or_no=is_yes_or_no)
 
     def draw(axes: Axes) -> None:
         is_few = len(shots) <= 500
         look: dict[str, Any] = {"marker": "o", "markersize": 3 if is_few else 1, "markeredgewidth": 0}
-        if is_rate:
+        if is_yes_or_no:
             look = {
                 "marker": "|",
                 "markersize": 5 if is_few else 3,
                 "markeredgewidth": 0.8 if is_few else 0.3,
             }
         # an SVG or PDF file with more marks than these is slow to open
-        axes.plot(shots, 100 * values, color=LIGHT, linestyle="none", rasterized=len(shots) > 2000, **look)
+        axes.plot(shots, scale * values, color=LIGHT, linestyle="none", rasterized=len(shots) > 2000, **look)
         x, y, low, high = running
         has_error = np.isfinite(low) & np.isfinite(high)
         axes.fill_between(
-            x, 100 * low, 100 * high, where=has_error, color=DARK, alpha=0.2, linewidth=0, zorder=3
+            x, scale * low, scale * high, where=has_error, color=DARK, alpha=0.2, linewidth=0, zorder=3
         )
-        axes.plot(x, 100 * y, color=DARK, linewidth=1.4, marker="o" if len(x) == 1 else "", zorder=4)
+        axes.plot(x, scale * y, color=DARK, linewidth=1.4, marker="o" if len(x) == 1 else "", zorder=4)
         averaged = "1 shot" if window == 1 else f"{window} shots"
-        axes.set(title=f"{name} by shot; line: mean of {averaged}", xlabel="shot", ylabel=f"{name} (%)")
+        title, label = f"{name} by shot; line: mean of {averaged}", f"{name} ({unit})" if unit else name
+        axes.set(title=title, xlabel="shot", ylabel=label)
         axes.set_xlim(shots[0] - 0.5, shots[-1] + 0.5)
         # -4 and 104 leave room for the marks at 0 and 100 %
-        axes.set_ylim(*((-4.0, 104.0) if is_rate else _with_room(100 * values, 0.1, MIN_RANGE_PERCENT)))
+        least = MIN_RANGE_PERCENT if unit == "%" else 0.0
+        axes.set_ylim(*((-4.0, 104.0) if is_yes_or_no else _with_room(scale * values, 0.1, least)))
         whole_numbers(axes.xaxis)
 
     return draw
 
 
-def running_mean(shots: Floats, values: Floats, *, is_rate: bool) -> tuple[int, Floats]:
+def running_mean(shots: Floats, values: Floats, *, is_yes_or_no: bool) -> tuple[int, Floats]:
     """The number of shots in a running mean, and the mean, see :func:`points_of`."""
     window = min(len(values), max(10, len(values) // 10))
     starts = np.unique(np.linspace(0, len(values) - window, MAX_POINTS).astype(np.int64))
     parts = [values[start : start + window].tolist() for start in starts]
-    means = [Rate(round(math.fsum(part)), window) if is_rate else mean(part) for part in parts]
+    means = [Rate(round(math.fsum(part)), window) if is_yes_or_no else mean(part) for part in parts]
     return window, points_of(((shots[starts] + shots[starts + window - 1]) / 2).tolist(), means)
 
 

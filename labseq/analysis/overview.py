@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import product
+from itertools import product, zip_longest
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
@@ -29,7 +29,6 @@ from labseq.analysis.charts import (
     trend,
 )
 from labseq.analysis.scanned import (
-    DEFAULT,
     ScanRequest,
     scan_report,
     shown_unit,
@@ -41,7 +40,7 @@ from labseq.calibration_store import read_entry
 from labseq.data import Run, Shot
 from labseq.data.fits import Fit, readable
 from labseq.data.images import loading_map
-from labseq.data.quantities import Quantity, steps_that_load
+from labseq.data.quantities import WITH_TARGET, Quantity, measured_by, quantity_of, steps_that_load
 from labseq.data.scanned import FitAt, Scanned, is_geometric, scanned
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites
 from labseq.errors import ConfigError, Problem, RecordingError, one_of
@@ -121,15 +120,17 @@ def overview(run: Run) -> RunPicture:
         RecordingError: It is damaged.
     """
     summary = _Summary(_with_shots(run), 60)  # files of shots, which take half a second to read
-    filling, success = (_fraction_row(summary, name) for name in DEFAULT)
     survival, timing = summary.read
-    rows = [
-        _present(*filling, defects_panel(run, summary.statistics)),
-        _present(*success, loss_causes(summary.statistics.losses) or lost_by_cycle(run, survival)),
-        _present(*survival_panels(run, survival), stages_panel(run, timing)),
-    ]
-    if summary.scan is not None and len(maps := scan_panels(summary.scan, summary.quantity(DEFAULT[1]))) > 1:
-        rows.insert(2, maps)  # a single map is in the row of its quantity
+    beside = (
+        defects_panel(run, summary.statistics),
+        loss_causes(summary.statistics.losses) or lost_by_cycle(run, survival),
+    )
+    names = measured_by(run)
+    measured = (_quantity_row(summary, name) for name in names)
+    rows = [_present(*(row or ()), panel) for row, panel in zip_longest(measured, beside)]
+    if summary.scan is not None:  # a single map is in the row of its quantity
+        rows += [maps for name in names if len(maps := scan_panels(summary.scan, summary.quantity(name))) > 1]
+    rows.append(_present(*survival_panels(run, survival), stages_panel(run, timing)))
     return _picture(run, f"run {clean(run.name)}", rows)
 
 
@@ -382,7 +383,7 @@ class _Summary:
 
     def quantity(self, name: str) -> Quantity:
         """A quantity of the run."""
-        return self.run.quantity(name)
+        return quantity_of(self.run, name)
 
     @cached_property
     def read(self) -> tuple[Survival, RunTiming]:
@@ -398,15 +399,23 @@ class _Summary:
         return survival, totals.sum_up(self.run)
 
 
-def _fraction_row(summary: _Summary, name: str) -> Row:
-    """A fraction against shot, cycle and scanned value, where available."""
+def _quantity_row(summary: _Summary, name: str) -> Row:
+    """A quantity against shot, cycle and scanned value, where available."""
     quantity = summary.quantity(name)
     maps = scan_panels(summary.scan, quantity) if summary.scan is not None else ()
-    by_cycle = cycles_panel(quantity, summary.statistics)
+    by_cycle = cycles_panel(quantity, summary.statistics) if name in WITH_TARGET else None
     shots = summary.run.shots
     values = np.array([quantity.of_shot(shot) for shot in shots])
     indices = np.array([float(shot.index) for shot in shots])
-    by_shot = trend(title_of(quantity), indices, values, is_rate=quantity.is_rate)
+    unit, factor = shown_unit(quantity, values.tolist())
+    by_shot = trend(
+        title_of(quantity),
+        indices,
+        values,
+        is_yes_or_no=name in ("defect_free", "success"),
+        unit=unit,
+        scale=1 / factor,
+    )
     return _present(by_shot, by_cycle, *(maps if len(maps) == 1 else ()))
 
 
@@ -466,8 +475,8 @@ CHOICES: Final[Mapping[str, tuple[str, Callable[[_Summary], list[Row]], str]]] =
             lambda s: _image_rows(s, signals_of_sites),
             "a detector that reports its signals",
         ),
-        "filling": ("filling", lambda s: [_fraction_row(s, "filling")], _WITH_IMAGES),
-        "success": ("defect-free shots", lambda s: [_fraction_row(s, "defect_free")], _WITH_IMAGES),
+        "filling": ("filling", lambda s: [_quantity_row(s, "filling")], _WITH_IMAGES),
+        "success": ("defect-free shots", lambda s: [_quantity_row(s, "defect_free")], _WITH_IMAGES),
         "survival": (
             "survival by site",
             lambda s: [survival_panels(s.run, s.read[0])],

@@ -5,24 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from labseq.console.report import aligned
 from labseq.console.text import count_of
 from labseq.data import Run
 from labseq.data.columns import Column, make_column
 from labseq.data.points import ScanPoint
-from labseq.data.quantities import Quantity, description_of, find_quantity
+from labseq.data.quantities import Quantity, description_of, find_quantity, measured_by, quantity_of
 from labseq.data.scanned import FitAt, FitRequest, Scanned, fits_along, scanned
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.units import UNITS, dimension_of, readable_unit
-
-DEFAULT: Final = ("filling", "defect_free")
-"""The quantities at the points of a scan, unless others are named."""
-WITHOUT_TARGET: Final = ("n_loaded", "n_atoms")
-"""The quantities at the points of a scan of a run without a target, unless others are named."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +25,8 @@ class ScanRequest:
     """The quantities to show at the points of a scan, and their fits.
 
     Attributes:
-        names: Names of the quantities; none for :data:`DEFAULT`.
-        fit: The fit of each; None without.
+        names: Names of the quantities; none for those that the run measures.
+        fit: The fit of each; None for those that its sequence asks for.
     """
 
     names: tuple[str, ...] = ()
@@ -178,8 +173,10 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
     if not run.shots:
         raise ConfigError(Problem("the run has no shots yet", visible(str(run.path))))
     scan = scanned(run) or Scanned((), ((),), (ScanPoint({}, {}, tuple(run.shots)),))
-    names = request.names or (*_aim(run), *(WITHOUT_TARGET if run.target.is_none else DEFAULT))
-    quantities = [find_quantity(run, name) for name in names]
+    if request.names:
+        quantities = [find_quantity(run, name) for name in request.names]
+    else:
+        quantities = [quantity_of(run, name) for name in dict.fromkeys((*_aim(run), *measured_by(run)))]
     values = tuple((quantity, scan.over(quantity)) for quantity in quantities)
     for quantity, means in values if request.names else ():
         if all(math.isnan(mean.value) for mean in means):
@@ -196,7 +193,7 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
 def _aim(run: Run) -> tuple[str, ...]:
     """The quantity that an adaptive scan optimises, unless it is shown anyway."""
     name = str(run.scan.get("figure") or "")
-    return (name,) if name and name not in {*DEFAULT, "filling_fraction", "success"} else ()
+    return (name,) if name and name not in {"filling_fraction", "success"} else ()
 
 
 def fit_lines(fits: Sequence[FitAt]) -> list[str]:

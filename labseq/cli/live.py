@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-import statistics
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence, Sized
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Final, TextIO
 
@@ -19,14 +17,14 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from labseq.analysis.scanned import shown_unit, title_of, value_text
+from labseq.cli.tally import ScanTally, Tally
 from labseq.console.arrays import Glyphs, draw_array, glyphs_for, scales
-from labseq.console.events import LASTING, LogLines, best_text, event_text, scanned_names
+from labseq.console.events import LASTING, LogLines, event_text
 from labseq.console.text import clock_time, count_of, plural
-from labseq.data.points import ChosenPoints
-from labseq.model import ImageRecord, RunRecord, StageTiming
-from labseq.model.estimate import Estimate, jeffreys, mean
-from labseq.recording.index import IndexRow
-from labseq.recording.run_file import SCANNER
+from labseq.data.measured import Measured, Sums
+from labseq.model import RunRecord
+from labseq.model.estimate import jeffreys
 from labseq.units import format_quantity
 
 REDRAW_S: Final = 0.25
@@ -104,6 +102,7 @@ class LiveView:
 
     def _draw(self) -> None:
         self._drawn_s = self._now()
+        self._tally.look()
         self._live.refresh()
 
 
@@ -149,10 +148,10 @@ class Picture:
     def _body(self, lines_of: Callable[[RenderableType], Sized], width: int, room: int) -> RenderableType:
         """The numbers, with the array on their left and the plot of a scan below if they fit."""
         tally, glyphs = self._tally, self._glyphs
-        parts: list[RenderableType] = [_rates(tally), Text(), _stages(tally), *_caption(tally)]
+        parts: list[RenderableType] = [_results(tally), Text(), _stages(tally), *_caption(tally)]
         if tally.scan is not None:
             free = room - len(lines_of(Group(*parts))) - 1
-            plot = draw_scan(tally.scan, SIDE_WIDTH, min(free, _SCAN_HEIGHT), glyphs)
+            plot = draw_scan(tally.scan, tally.measured, SIDE_WIDTH, min(free, _SCAN_HEIGHT), glyphs)
             parts += [Text(), *plot] if plot else []
         array = _array(tally, width - _GAP - SIDE_WIDTH, room, glyphs)
         if not array:
@@ -206,18 +205,20 @@ def shear_of(run: RunRecord) -> int:
     return -1 if run.resolved.get("profile", {}).get("grid", {}).get("shear") == -1 else 1
 
 
-def _rates(tally: Tally) -> Table:
-    rate = count_of(tally.n_defect_free, tally.n_done)
-    if tally.n_done:
-        low, high = (100 * end for end in jeffreys(tally.n_defect_free, tally.n_done))
-        rate += f", {low:.0f}-{high:.0f} %"
-    filling = tally.filling.scaled(100.0)
+def _results(tally: Tally) -> Table:
+    """What the run measures; with a target, also whether it was met."""
     table = Table.grid(padding=(0, 2, 0, 0))
     table.add_column(style="bold", no_wrap=True)
     table.add_column(no_wrap=True)
-    table.add_row("defect-free", rate)
-    table.add_row("seen defect-free", count_of(tally.n_seen, tally.n_done))
-    table.add_row("filling", "-" if math.isnan(filling.value) else f"{filling} %")
+    if tally.n_judged:
+        low, high = (100 * end for end in jeffreys(tally.n_defect_free, tally.n_judged))
+        rate = count_of(tally.n_defect_free, tally.n_judged)
+        table.add_row("defect-free", f"{rate}, {low:.0f}-{high:.0f} %")
+        table.add_row("seen defect-free", count_of(tally.n_seen, tally.n_done))
+    for measured in tally.measured:
+        if measured.quantity.name != "defect_free":
+            value = value_text(measured.mean, measured.quantity, short=True)
+            table.add_row(title_of(measured.quantity), value)
     if tally.best:
         table.add_row("best so far", Text(tally.best))
     if tally.n_repeated:
@@ -273,46 +274,48 @@ _BAR: Final = 5
 """Maximum width of the bar of a point."""
 _LABEL: Final = 7
 """Width of the numbers on the left."""
-_FILLING_RANGE: Final = 0.01
-"""Minimum range of filling in the plot."""
+_LEAST_RANGE: Final = 0.01
+"""Minimum range of the plot, as a fraction of the largest value."""
 
 
-def draw_scan(tally: ScanTally, width: int, height: int, glyphs: Glyphs) -> list[Text]:
-    """Draw the share of defect-free shots at each point, or the filling while no shot is defect-free."""
-    points = tally.points()
-    shown = _merged([point for _, point in points], width - _LABEL)
-    taken = [point for point in shown if point.n_shots]
-    if not taken or width < MIN_WIDTH or height < MIN_HEIGHT:
+def draw_scan(
+    scan: ScanTally, measured: Sequence[Measured], width: int, height: int, glyphs: Glyphs
+) -> list[Text]:
+    """Draw the first quantity that has values, at each point of a scan."""
+    known = next((one for one in measured if one.total.n_shots), None)
+    if known is None or width < MIN_WIDTH or height < MIN_HEIGHT:
         return []
-    is_rate = any(point.n_defect_free for point in taken)
-    values = [
-        (point.n_defect_free if is_rate else point.filling) / point.n_shots if point.n_shots else None
-        for point in shown
-    ]
-    high = max(value for value in values if value is not None)
-    low = 0.0 if is_rate else min(high - _FILLING_RANGE, *(v for v in values if v is not None))
+    quantity, points = known.quantity, scan.points()
+    shown = _merged([known.at_points.get(number, Sums()) for _, number in points], width - _LABEL)
+    values = [sums.mean(is_rate=quantity.is_rate).value if sums.n_shots else None for sums in shown]
+    there = [value for value in values if value is not None]
+    if not there:
+        return []
+    unit, factor = shown_unit(quantity, there)
+    high = max(there)
+    low = 0.0 if quantity.is_rate else min(high - _LEAST_RANGE * (abs(high) or 1.0), *there)
     bar = max(1, min(_BAR, (width - _LABEL) // len(shown)))
-    rows = _bars(values, low, high, height - 2, bar, glyphs)
-    ends = [f"{round(100 * end, 1):g} %".rjust(_LABEL - 1) + " " for end in (high, low)]
+    rows = _bars(values, low, high or 1.0, height - 2, bar, glyphs)
+    ends = [f"{end / factor:.3g} {unit}".strip().rjust(_LABEL - 1) + " " for end in (high or 1.0, low)]
     margins = [ends[0], *[" " * _LABEL] * (len(rows) - 2), ends[1]]
     first, last = points[0][0], points[-1][0]
     below = first + last.rjust(bar * len(shown) - len(first))
     if len(points) == 1 or len(first) + len(last) + 1 > bar * len(shown):
         below = first if len(points) == 1 else f"{first} to {last}"
     return [
-        _line(f"{'defect-free' if is_rate else 'filling'} by {tally.name}", "bold"),
+        _line(f"{title_of(quantity)} by {scan.name}", "bold"),
         *(Text.assemble((m, "dim"), (row, "cyan")) for m, row in zip(margins, rows, strict=True)),
         _line(" " * _LABEL + below, "dim"),
     ]
 
 
-def _merged(points: Sequence[PointTally], room: int) -> list[PointTally]:
+def _merged(points: Sequence[Sums], room: int) -> list[Sums]:
     """The points, with neighbours added up if there is no room for all."""
     n = min(len(points), max(1, room))
     ends = [round(i * len(points) / n) for i in range(n + 1)] if n else []
-    merged: list[PointTally] = []
+    merged: list[Sums] = []
     for first, end in pairwise(ends):
-        total = PointTally()
+        total = Sums()
         for point in points[first:end]:
             total += point
         merged.append(total)
@@ -331,195 +334,3 @@ def _bars(
         cells = (min(steps, max(0, n - row * steps)) for n in filled)
         rows.append("".join((" " if not n else glyphs.levels[n - 1]) * (bar - len(gap)) + gap for n in cells))
     return rows
-
-
-STAGES: Final = ("arm", "expose", "read_out", "detect", "plan", "check", "prepare", "play", "move", "write")
-"""The stages that are shown, in order; a shot may have others."""
-
-
-_KEPT: Final = 200
-"""Number of latest durations of a stage for its median."""
-
-
-@dataclass(slots=True)
-class StageTally:
-    """The durations of one stage.
-
-    Attributes:
-        host_s: The latest durations, on this computer's clock.
-        duration_s: The latest durations, on the session's clock.
-        budget_s: The latest budget; nan if it has none.
-        n_over: Number of times that it exceeded its budget.
-    """
-
-    host_s: deque[float] = field(default_factory=lambda: deque[float](maxlen=_KEPT))
-    duration_s: deque[float] = field(default_factory=lambda: deque[float](maxlen=_KEPT))
-    budget_s: float = math.nan
-    n_over: int = 0
-
-    def add(self, timing: StageTiming) -> None:
-        """Add one duration."""
-        self.host_s.append(timing.host_s)
-        self.duration_s.append(timing.duration_s)
-        self.budget_s = timing.budget_s
-        self.n_over += timing.over_budget
-
-    def medians_s(self) -> tuple[float, float]:
-        """Median on this computer's clock, and on the session's."""
-        return statistics.median(self.host_s), statistics.median(self.duration_s)
-
-    def p99_s(self) -> float:
-        """The 99th percentile on this computer's clock: the second longest of 200."""
-        longest = sorted(self.host_s)
-        return longest[math.ceil(0.99 * len(longest)) - 1]
-
-
-@dataclass(slots=True)
-class PointTally:
-    """The shots of one point of a scan.
-
-    Attributes:
-        n_shots: Number of shots that are complete and judged.
-        n_defect_free: Number of them that met the target.
-        filling: Sum of their filling fractions.
-    """
-
-    n_shots: int = 0
-    n_defect_free: int = 0
-    filling: float = 0.0
-
-    def __iadd__(self, other: PointTally) -> PointTally:
-        self.n_shots += other.n_shots
-        self.n_defect_free += other.n_defect_free
-        self.filling += other.filling
-        return self
-
-
-class ScanTally:
-    """The points of a scan while it runs."""
-
-    def __init__(self, scan: Mapping[str, Any]) -> None:
-        self._scan = scan
-        self._chosen = ChosenPoints(scan) if SCANNER in scan else None
-        self._points: dict[int, PointTally] = {}
-
-    @property
-    def name(self) -> str:
-        """The scanned settings, as text."""
-        return ", ".join(scanned_names(self._scan))
-
-    def add(self, row: IndexRow) -> None:
-        """Count a shot, unless it was not judged or its point is unknown."""
-        number = self._number(row)
-        if number is not None and not math.isnan(row.filling_fraction):
-            point = self._points.setdefault(number, PointTally())
-            point += PointTally(1, int(bool(row.success)), row.filling_fraction)
-
-    def _number(self, row: IndexRow) -> int | None:
-        try:
-            if self._chosen is not None:
-                return self._chosen.number(row.parameters)
-            return self._scan["point_of_shot"][row.shot] if row.shot >= 0 else None
-        except (KeyError, IndexError):  # `labseq watch` on a damaged index
-            return None
-
-    def points(self) -> list[tuple[str, PointTally]]:
-        """The value of each point as text, and its shots; sorted by value if one number is scanned."""
-        chosen = self._chosen
-        written: list[list[str]] = self._scan.get("written", []) if chosen is None else chosen.written
-        values: list[list[Any]] = self._scan.get("points", []) if chosen is None else chosen.points
-        order = list(range(len(written)))
-        if all(len(value) == 1 and isinstance(value[0], float | int) for value in values):
-            order.sort(key=lambda i: values[i][0])
-        return [(", ".join(written[i]), self._points.get(i, PointTally())) for i in order]
-
-
-class Tally:
-    """Sums up a run's events; unknown events are ignored.
-
-    Attributes:
-        record: The run, from "run_starting" on.
-        n_before: Number of shots that were complete before the first event.
-        n_done: Number of shots completed since then.
-        n_defect_free: Number of them that met the target.
-        n_seen: Number of them that met it in at least one image.
-        n_repeated: Number of attempts that had to be repeated.
-        image: The last image.
-        image_shot: Index of the shot of the last image.
-        shot: Index of the current shot.
-        stages: Stage -> its durations.
-        scan: The points of the scan; None without one.
-        best: The best point of an adaptive scan so far, as text, or "".
-        status: Final status of the run, or "".
-    """
-
-    def __init__(self, now: Callable[[], float]) -> None:
-        self._now = now
-        self._first_shot_s = math.nan
-        self._fillings: list[float] = []
-        self.record: RunRecord | None = None
-        self.n_before = self.n_done = self.n_defect_free = self.n_seen = self.n_repeated = 0
-        self.image: ImageRecord | None = None
-        self.image_shot = self.shot = 0
-        self.stages = {name: StageTally() for name in STAGES}
-        self.scan: ScanTally | None = None
-        self.best = ""
-        self.status = ""
-
-    @property
-    def n_shots(self) -> int:
-        """Planned number of shots of the run."""
-        return self.record.n_shots if self.record is not None else 0
-
-    @property
-    def filling(self) -> Estimate:
-        """Mean filling fraction with its standard error."""
-        return mean(self._fillings)
-
-    @property
-    def time_left_s(self) -> float:
-        """Expected time to the end of the run, from the shots so far; nan before the first complete shot."""
-        if not self.n_done:
-            return math.nan
-        return (self._now() - self._first_shot_s) / self.n_done * (self.n_shots - self.n_before - self.n_done)
-
-    def add(self, name: str, values: Mapping[str, Any]) -> None:
-        """Add an event to the numbers."""
-        match name:
-            case "stage":
-                timing: StageTiming = values["timing"]
-                if timing.stage in self.stages:
-                    self.stages[timing.stage].add(timing)
-            case "image":
-                self.image, self.image_shot = values["image"], self.shot
-            case "shot_started":
-                self.shot = values["shot"]
-                if math.isnan(self._first_shot_s):
-                    self._first_shot_s = self._now()
-            case "shot_finished":
-                self._count(values["row"])
-            case "shot_repeated":
-                self.n_repeated += 1
-            case "run_starting":
-                self.record = values["record"]
-                self.n_before = values.get("n_before", 0) - self.n_done  # `watch` has counted them itself
-                self.status = ""
-                if self.scan is None and values["record"].scan:  # the points of a resumed run are kept
-                    self.scan = ScanTally(values["record"].scan)
-            case "scan_point":
-                self.best = best_text(values)
-            case "run_finished":
-                self.status = values["status"]
-            case _:
-                pass
-
-    def _count(self, row: IndexRow) -> None:
-        if not row.counts:
-            return
-        self.n_done += 1
-        self.n_defect_free += bool(row.success)
-        self.n_seen += row.was_defect_free
-        if self.scan is not None:
-            self.scan.add(row)
-        if not math.isnan(row.filling_fraction):
-            self._fillings.append(row.filling_fraction)

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from labseq.analysis.scanned import ScanReport, ScanRequest, scan_report
 from labseq.cli.summary import MAX_ROWS, Summary
@@ -18,8 +18,10 @@ from labseq.console.report import Column, print_report, table
 from labseq.console.runs import chosen_run
 from labseq.console.text import percent, settings_text, time_text
 from labseq.data import Run, Shot
+from labseq.data.quantities import WITH_TARGET, measured_by, quantity_of
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, visible
+from labseq.model.image_quantities import OF_IMAGES, parse_name
 
 if TYPE_CHECKING:
     from labseq.analysis.timing import RunTiming, StageStatistics
@@ -53,7 +55,7 @@ def show_run(
             print_report(Summary().ended_by(error), as_json=True)
         raise
     if not wanted.any and not as_json:
-        say(*shot_table([ShotRow.of(shot, run) for shot in run.shots], most=MAX_ROWS), "")
+        say(*shot_table(shot_rows(run, run.shots), most=MAX_ROWS), "")
     print_report(report, as_json=as_json)
 
 
@@ -64,6 +66,7 @@ class ShotRow:
     Attributes:
         scanned: Address -> scanned value, in the units of the sequence.
         outcome: The result in words.
+        measured: Quantity that the run measures -> its value, SI; those with words of their own left out.
     """
 
     index: int
@@ -72,6 +75,7 @@ class ShotRow:
     error: str
     scanned: Mapping[str, str]
     outcome: str
+    measured: Mapping[str, float]
     success: bool | None
     filling_fraction: float
     seen_defect_free_cycle: int
@@ -84,19 +88,23 @@ class ShotRow:
     parameters: Mapping[str, Any]
     file: str
 
-    @classmethod
-    def of(cls, shot: Shot, run: Run) -> ShotRow:
-        """The row of a shot of a run."""
-        addresses = [str(address) for address in run.scan.get("addresses", ())]
-        computed = {
-            "index": shot.index,
-            "scanned": dict(
-                zip(addresses, scanned_values(run.scan, shot.index, shot.parameters), strict=True)
-            ),
-            "outcome": _outcome(shot, run),
-        }
-        names = [field.name for field in fields(cls) if field.name not in computed]
-        return cls(**computed, **{name: getattr(shot.row, name) for name in names})
+
+def shot_rows(run: Run, shots: Sequence[Shot]) -> list[ShotRow]:
+    """The rows of some shots of a run."""
+    addresses = [str(address) for address in run.scan.get("addresses", ())]
+    quantities = [quantity_of(run, name) for name in measured_by(run) if name not in WITH_TARGET]
+    computed = {"index", "scanned", "outcome", "measured"}
+    names = [field.name for field in fields(ShotRow) if field.name not in computed]
+    return [
+        ShotRow(
+            index=shot.index,
+            scanned=dict(zip(addresses, scanned_values(run.scan, shot.index, shot.parameters), strict=True)),
+            outcome=_outcome(shot, run),
+            measured={quantity.name: quantity.of_shot(shot) for quantity in quantities},
+            **{name: getattr(shot.row, name) for name in names},
+        )
+        for shot in shots
+    ]
 
 
 def _outcome(shot: Shot, run: Run) -> str:
@@ -105,24 +113,34 @@ def _outcome(shot: Shot, run: Run) -> str:
     return outcome(shot.success, shot.seen_defect_free_cycle, shot.filling_fraction, run.target.n_atoms)
 
 
-SHOTS: Final[Sequence[Column[ShotRow]]] = (
-    Column("shot", lambda shot: shot.index, right=True),
-    Column("outcome", lambda shot: shot.outcome),
-    Column("filling", lambda shot: percent(shot.filling_fraction), right=True),
-    Column("cycles", lambda shot: shot.n_cycles, right=True),
-    Column("atom moves", lambda shot: shot.n_atom_moves, right=True),
-    Column("shot time", lambda shot: time_text(shot.duration_s), right=True),
-)
-
-
 def shot_table(shots: Sequence[ShotRow], *, details: bool = False, most: int = 0) -> list[str]:
     """A row per shot; with details also scanned values and batches."""
-    columns = [*SHOTS]
-    if details:
-        columns.insert(-2, Column("batches", lambda shot: shot.n_batches, right=True))
-        addresses = shots[0].scanned if shots else ()
-        columns[1:1] = [Column(clean(address), _scanned(address), right=True) for address in addresses]
+    first = shots[0] if shots else None
+    is_judged = any(not math.isnan(shot.filling_fraction) for shot in shots)
+    moves = any(shot.n_cycles for shot in shots)
+    columns: list[Column[ShotRow]] = [
+        Column("shot", lambda shot: shot.index, right=True),
+        *(Column(clean(a), _scanned(a), right=True) for a in (first.scanned if first and details else ())),
+        Column("outcome", lambda shot: shot.outcome),
+        *(Column(clean(name), _measured(name), right=True) for name in (first.measured if first else ())),
+    ]
+    if is_judged:
+        columns.append(Column("filling", lambda shot: percent(shot.filling_fraction), right=True))
+    if moves:
+        columns.append(Column("cycles", lambda shot: shot.n_cycles, right=True))
+        if details:
+            columns.append(Column("batches", lambda shot: shot.n_batches, right=True))
+        columns.append(Column("atom moves", lambda shot: shot.n_atom_moves, right=True))
+    columns.append(Column("shot time", lambda shot: time_text(shot.duration_s), right=True))
     return table(shots, columns, most)
+
+
+def _measured(name: str) -> Callable[[ShotRow], str]:
+    def text(shot: ShotRow) -> str:
+        value, kind = shot.measured[name], parse_name(name).kind
+        return percent(value) if kind in OF_IMAGES else "-" if math.isnan(value) else f"{value:.6g}"
+
+    return text
 
 
 def _scanned(address: str) -> Callable[[ShotRow], str]:
@@ -173,7 +191,7 @@ class RunTables:
         return cls(
             run_dir=run.path,
             status=run.status,
-            shot_list=[ShotRow.of(shot, run) for shot in attempts] if wanted.shots else None,
+            shot_list=shot_rows(run, attempts) if wanted.shots else None,
             timing=_read_timing(run) if wanted.timing else None,
             scan=None if wanted.scan is None else _read_scan(run, wanted.scan),
             devices=_devices(run) if wanted.devices else None,

@@ -25,10 +25,11 @@ from labseq.console.text import count_of, plural, quoted
 from labseq.data import Run
 from labseq.data.best import BestPoint, best_point
 from labseq.data.follower import Follower
+from labseq.data.quantities import WITH_TARGET, WITHOUT_TARGET, Quantity, measured_by, quantity_of
 from labseq.data.scanned import scanned
 from labseq.errors import StopRequested
 from labseq.messages import clean
-from labseq.model.estimate import Estimate, mean
+from labseq.model.estimate import Estimate, Estimated, mean
 from labseq.units import format_quantity
 from labseq.watchdog import watchdog_lines
 
@@ -67,6 +68,7 @@ class Summary:
         n_attempts: Number of attempts that did not complete.
         has_target: Whether the sequence has a target.
         n_atoms: Mean number of atoms on the first and on the last image; none without images.
+        measured: What the run measures, each with its mean over all shots.
         scan: Filling and defect-free fraction at each point of the scan.
         best: The best point of an adaptive scan.
         wall_time_s: Time until the end of the last shot; of a resumed run, of all its parts together.
@@ -87,6 +89,7 @@ class Summary:
     n_attempts: int = 0
     has_target: bool = True
     n_atoms: Sequence[Estimate] = ()
+    measured: Sequence[tuple[Quantity, Estimated]] = ()
     scan: ScanReport | None = None
     best: BestPoint | None = None
     wall_time_s: float = math.nan
@@ -110,6 +113,7 @@ class Summary:
             n_attempts=len(run.attempts),
             has_target=not run.target.is_none,
             n_atoms=_n_atoms(run),
+            measured=[(one := quantity_of(run, name), one.over(run.shots)) for name in measured_by(run)],
             scan=None if scanned(run) is None else scan_report(run, ScanRequest()),
             best=best_point(run),
             wall_time_s=_wall_time_s(run),
@@ -125,6 +129,7 @@ class Summary:
     def as_json(self) -> dict[str, Any]:
         """All attributes; of the scan, its points stand beside them."""
         values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "scan"}
+        values["measured"] = {quantity.name: mean for quantity, mean in self.measured}
         return values | (self.scan.as_json() if self.scan else {})
 
     def as_text(self) -> list[str]:
@@ -147,6 +152,7 @@ class Summary:
             *_skipped_rows(self.skipped_shots),
             *_best_rows(self.best),
             *(statistics_rows(self.statistics) if self.has_target else _atom_rows(self.n_atoms)),
+            *_measured_rows(self.measured),
             ("wall time", _wall_time(self.wall_time_s)),
             *(("watchdog", clean(line)) for line in self.watchdog),
             *([("warning", damaged)] if self.n_damaged_lines else []),
@@ -173,6 +179,12 @@ def _atom_rows(n_atoms: Sequence[Estimate]) -> Facts:
     """The atoms on the images of a run without a target."""
     texts = [f"{n} on the {which} image" for n, which in zip(n_atoms, ("first", "last"), strict=False)]
     return [("target", "none"), *([("atoms", ", ".join(texts))] if texts else [])]
+
+
+def _measured_rows(measured: Sequence[tuple[Quantity, Estimated]]) -> Facts:
+    """What a run measures over all its shots; what has rows of its own is left out."""
+    own = (one for one in measured if one[0].name not in (*WITH_TARGET, *WITHOUT_TARGET))
+    return [(title_of(quantity), value_text(mean, quantity)) for quantity, mean in own]
 
 
 CYCLES: Final[Sequence[Column[CycleStatistics]]] = (

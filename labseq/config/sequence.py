@@ -76,7 +76,7 @@ class MeasureSettings(Settings):
     report: Text | None = Field(
         default=None, description="parameter of the fit that is the result of the run; by default its first"
     )
-    parameters: Annotated[dict[str, bool | int | float | str], empty_is({})] = Field(
+    parameters: Annotated[dict[str, int | float | str], empty_is({})] = Field(
         default={}, description="parameters of the fit that are fixed: `{offset: 0}`; `free` frees one"
     )
 

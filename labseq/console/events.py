@@ -128,7 +128,10 @@ def shot_text(row: IndexRow, run: RunRecord | None) -> str:
     if row.status != "complete":
         return f"{name}  {row.status}" + (f": {row.error}" if row.status == "failed" else "")
     n_atoms = run.target.n_atoms if run is not None else 0
-    parts = [name, outcome(bool(row.success), row.seen_defect_free_cycle, row.filling_fraction, n_atoms)]
+    parts = [name]
+    if n_atoms:
+        parts.append(outcome(bool(row.success), row.seen_defect_free_cycle, row.filling_fraction, n_atoms))
+    parts += measured_texts(row)
     if not math.isnan(row.filling_fraction):
         parts.append(f"filling {percent(row.filling_fraction)}")
     if row.n_missing_atoms:
@@ -136,6 +139,12 @@ def shot_text(row: IndexRow, run: RunRecord | None) -> str:
     if not math.isnan(row.duration_s):
         parts.append(format_quantity(row.duration_s, "time"))
     return "  ".join(parts)
+
+
+def measured_texts(row: IndexRow) -> list[str]:
+    """What the run measures in a shot, as far as its images tell; the filling has its own words."""
+    own = {name: events for name, events in row.measured.items() if name not in ("filling", "defect_free")}
+    return [f"{clean(name)} {percent(n / n_trials)}" for name, (n, n_trials) in own.items() if n_trials]
 
 
 def point_of_shot(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, Any]) -> str:
@@ -181,7 +190,7 @@ def outcome(success: bool, seen_cycle: int, filling_fraction: float, n_atoms: in
     if success:
         return seen or "defect-free"
     if math.isnan(filling_fraction):
-        return "not judged: no image" if n_atoms else "no target"
+        return "not judged: no image" if n_atoms else "complete"
     n_defects = round((1.0 - filling_fraction) * n_atoms)
     defects = plural(n_defects, "defect") if n_defects else "surplus atoms"
     return f"{defects} ({seen})" if seen else defects

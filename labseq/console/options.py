@@ -204,7 +204,8 @@ ScanQuantities = Annotated[
         metavar="[QUANTITY]",
         help="A quantity at each point of the scan: survival:before,after between two images, filling, "
         "defect_free or loading (also of one image: filling:before), any column of labseq export, or "
-        "analysis.NAME.KEY; default: filling and defect_free. May be given several times.",
+        "analysis.NAME.KEY; of some sites with @target, @reservoir or @ROWS,COLUMNS; default: what the run "
+        "measures. May be given several times.",
     ),
 ]
 Where = Annotated[

@@ -26,6 +26,7 @@ from labseq.model.image_quantities import (
     events_of,
     find_image,
     mask_of,
+    measured_in,
     parse_name,
 )
 from labseq.recording.index import IndexRow
@@ -61,17 +62,18 @@ class Quantity:
 
     def of_shot(self, shot: Shot) -> float:
         """The value of a shot; nan if it has none, or its file cannot be read."""
-        n, n_trials = self._events(shot)
+        n, n_trials = self.events(shot)
         return n / n_trials if n_trials else math.nan
 
     def over(self, shots: Iterable[Shot]) -> Estimated:
         """The mean over those shots that have a value, with its error."""
-        events = [(n, n_trials) for n, n_trials in map(self._events, shots) if n_trials and not math.isnan(n)]
+        events = [(n, n_trials) for n, n_trials in map(self.events, shots) if n_trials and not math.isnan(n)]
         if self.is_rate:
             return Rate(round(sum(n for n, _ in events)), round(sum(n for _, n in events)))
         return mean([n / n_trials for n, n_trials in events])
 
-    def _events(self, shot: Shot) -> Events:
+    def events(self, shot: Shot) -> Events:
+        """The value of a shot and 1, or its events and trials; 0 trials without a value."""
         try:
             return self.events_of(shot)
         except RecordingError:
@@ -109,14 +111,18 @@ def make_quantity(
 
 def _in_index(name: str, row: IndexRow, target: TargetPattern) -> Events | None:
     """A quantity of images as far as the index has it: the shot's file is then not read."""
-    images = row.images
-    if name in row.measured or not len(images) or target.is_none:
-        return row.measured.get(name)
-    if name == "filling" and target.n_atoms:
-        return 1 - images.n_defects[-1] / target.n_atoms, 1
-    if name == "defect_free":
-        return float(not images.n_defects[-1] and not images.n_surplus[-1]), 1
-    return None
+    if name in row.measured:
+        return row.measured[name]
+    if name not in WITH_TARGET or target.is_none:
+        return None
+    if not math.isnan(row.filling_fraction):
+        return (row.filling_fraction if name == "filling" else float(bool(row.success))), 1
+    if not len(row.images):
+        return None
+    n_defects, n_surplus = row.images.n_defects[-1], row.images.n_surplus[-1]
+    if name == "filling":
+        return (1 - n_defects / target.n_atoms, 1) if target.n_atoms else None
+    return float(not n_defects and not n_surplus), 1
 
 
 def quantity_problem(
@@ -216,6 +222,21 @@ def find_quantity(run: Run, name: str) -> Quantity:
         raise ConfigError(Problem(message, clean(run.path.name), expected=expected, hint=hint))
     _check_no_load(run, name)
     return quantity_of(run, name)
+
+
+WITH_TARGET: Final = ("filling", "defect_free")
+WITHOUT_TARGET: Final = ("n_loaded", "n_atoms")
+"""What a run of an earlier version is taken to measure, with a target and without one."""
+
+
+def measured_by(run: Run) -> tuple[str, ...]:
+    """Names of the quantities that a run measures, the most important first."""
+    return names_measured(run.record.get("resolved") or {}, run.target)
+
+
+def names_measured(resolved: Mapping[str, Any], target: TargetPattern) -> tuple[str, ...]:
+    """The same, from the settings and the target of a run."""
+    return measured_in(resolved) or (WITHOUT_TARGET if target.is_none else WITH_TARGET)
 
 
 def quantity_of(run: Run, name: str) -> Quantity:

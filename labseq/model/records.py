@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -186,8 +187,10 @@ def follow_atoms(before: Occupancy, cycles: Iterable[CycleRecord]) -> tuple[Occu
     """
     atoms, moved = before.copy(), np.zeros_like(before)
     for cycle in cycles:
-        for batch in cycle.plan.batches[: cycle.n_batches_played]:
-            start, end = tuple(batch.from_sites.T), batch.to_sites
+        plan = cycle.plan
+        for first, last in pairwise(plan.batch_offsets[: cycle.n_batches_played + 1].tolist()):
+            moves = plan.moves[first:last]
+            start, end = tuple(moves[:, :2].T), moves[:, 2:]
             carried = atoms[start]
             atoms[start] = moved[start] = False
             inside = carried & ((end >= 0) & (end < before.shape)).all(axis=1)

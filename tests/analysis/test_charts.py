@@ -40,7 +40,7 @@ def stage(name: str, session_s: tuple[float, float], host_s: tuple[float, float]
 def trend_of(n: int, *, is_rate: bool = False) -> Panel:
     shots = np.arange(1.0, n + 1)
     values = shots % 2 if is_rate else 1 - 0.01 * (shots % 3)
-    return trend("a trend", shots, values, is_rate=is_rate) or no_panel
+    return trend("a trend", shots, values, is_yes_or_no=is_rate) or no_panel
 
 
 def no_panel(_: object) -> None:
@@ -125,7 +125,7 @@ def test_a_stage_has_its_median_and_its_budget() -> None:
 
 def test_a_running_rate_has_jeffreys_intervals() -> None:
     shots = np.arange(30.0)
-    window, points = running_mean(shots, 1.0 - shots % 2, is_rate=True)
+    window, points = running_mean(shots, 1.0 - shots % 2, is_yes_or_no=True)
     assert window == 10
     assert points[0, 0] == 4.5
     assert tuple(points[2:, 0]) == jeffreys(5, 10)

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given, strategies as st
 from rich.console import Console
 
-from labseq.cli.live import REDRAW_S, LiveView, Picture, ScanTally, Tally, draw_scan, observer_for
+from labseq.cli.live import REDRAW_S, LiveView, Picture, draw_scan, observer_for
+from labseq.cli.tally import Tally
 from labseq.console.arrays import ASCII, UNICODE
 from labseq.console.events import LogLines
 from labseq.model import StageTiming
 
-from .conftest import make_row
+from .conftest import make_row, make_run
 
 
 @pytest.fixture(autouse=True)
@@ -245,8 +246,8 @@ def test_a_scan_is_drawn_where_there_is_room(fake: Any) -> None:
     }
     run = replace(fake.run(), scan=scan)
     tally = tally_of(fake, run)
-    assert any("defect-free by dop" in line for line in picture(tally, 120, 36))
-    assert not any("defect-free by dop" in line for line in picture(tally, 120, 18))
+    assert any("filling by dop" in line for line in picture(tally, 120, 36))
+    assert not any("filling by dop" in line for line in picture(tally, 120, 18))
 
 
 def scan(values: list[Any], *, repeats: int = 1) -> dict[str, Any]:
@@ -258,15 +259,20 @@ def scan(values: list[Any], *, repeats: int = 1) -> dict[str, Any]:
     }
 
 
-def scan_tally(values: list[Any], shots: list[tuple[int, bool, float]]) -> ScanTally:
-    tally = ScanTally(scan(values))
+def scan_tally(values: list[Any], shots: list[tuple[int, bool, float]], *measured: str) -> Tally:
+    """A run that measures whether the target is met, unless others are named."""
+    settings = {"measure": [{"value": name} for name in measured or ("defect_free",)]}
+    tally = Tally(lambda: 0.0)
+    record = replace(make_run(), scan=scan(values), resolved=settings)
+    tally.add("run_starting", {"record": record, "run_dir": "x"})
     for index, success, filling in shots:
-        tally.add(make_row(index, success=success, filling=filling))
+        tally.add("shot_finished", {"row": make_row(index, success=success, filling=filling)})
     return tally
 
 
-def plot(tally: ScanTally, width: int = 40, height: int = 6, glyphs: Any = UNICODE) -> list[str]:
-    return [line.plain for line in draw_scan(tally, width, height, glyphs)]
+def plot(tally: Tally, width: int = 40, height: int = 6, glyphs: Any = UNICODE) -> list[str]:
+    assert tally.scan is not None
+    return [line.plain for line in draw_scan(tally.scan, tally.measured, width, height, glyphs)]
 
 
 def test_points_stand_in_the_order_of_their_values() -> None:
@@ -281,8 +287,9 @@ def test_points_stand_in_the_order_of_their_values() -> None:
     ]
 
 
-def test_without_a_defect_free_shot_the_filling_is_drawn() -> None:
-    drawn = plot(scan_tally([1, 2, 3], [(0, False, 0.98), (2, False, 0.99)]), glyphs=ASCII)
+def test_the_first_quantity_that_has_values_is_drawn() -> None:
+    shots = [(0, False, 0.98), (2, False, 0.99)]
+    drawn = plot(scan_tally([1, 2, 3], shots, "reading.power_w", "filling", "defect_free"), glyphs=ASCII)
     assert drawn[0] == "filling by dop"
     assert (drawn[1][:7], drawn[-2][:7]) == ("  99 % ", "  98 % ")
     assert drawn[-2][7:] == "....      #### "

@@ -43,9 +43,9 @@ def test_table_and_summary(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixt
     show_run(folder, as_json=False)
     lines = capsys.readouterr().out.splitlines()
     assert [" ".join(line.split()) for line in lines[1:4]] == [
-        "0 defect-free after 2 cycles 100.0 % 0 0 1.9 s",
-        "1 2 defects 99.1 % 0 0 1.9 s",
-        "2 not judged: no image - 0 0 1.9 s",
+        "0 defect-free after 2 cycles 100.0 % 1.9 s",
+        "1 2 defects 99.1 % 1.9 s",
+        "2 not judged: no image - 1.9 s",
     ]
     assert "shots             3 of 3, 1 attempt kept that did not complete" in lines
     assert "defect-free       1 of 2 (50.0 %), 21.6 to 78.4 %" in lines  # one was not judged
@@ -213,9 +213,9 @@ def test_every_shot_and_every_attempt_has_a_row(folder: Path, capsys: pytest.Cap
     lines = shown(folder, capsys, shots=True)
     assert lines[0].split()[:2] == ["shot", "shot.2.rearrange.window"]
     assert [" ".join(line.split()) for line in lines[1:]] == [
-        "0 60 ms defect-free after 2 cycles 100.0 % 0 0 0 1.9 s",
-        "1 100 ms attempt 0 failed: TransientError: no light 100.0 % 0 0 0 1.9 s",
-        "1 100 ms 2 defects 99.1 % 0 0 0 1.9 s",
+        "0 60 ms defect-free after 2 cycles 100.0 % 1.9 s",
+        "1 100 ms attempt 0 failed: TransientError: no light 100.0 % 1.9 s",
+        "1 100 ms 2 defects 99.1 % 1.9 s",
     ]
 
 

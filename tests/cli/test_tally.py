@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.live import Tally
+from labseq.cli.tally import Tally
 from labseq.model import StageTiming
-from labseq.model.estimate import Estimate
+from labseq.model.estimate import Estimate, Rate
 
 
 def played(tally: Tally, events: Any) -> Tally:
@@ -20,7 +20,8 @@ def test_a_run_is_summed_up(fake: Any) -> None:
     tally = played(Tally(lambda: 0.0), fake.script(fake.run(), n_shots=3))
     assert (tally.n_done, tally.n_defect_free, tally.n_seen) == (3, 3, 3)
     assert tally.n_shots == 20
-    assert tally.filling == Estimate(1.0, 0.0)
+    assert [one.quantity.name for one in tally.measured] == ["filling", "defect_free"]
+    assert [one.mean for one in tally.measured] == [Estimate(1.0, 0.0), Rate(3, 3)]
     assert (tally.image_shot, tally.image.cycle if tally.image else None) == (2, 1)
     assert len(tally.stages["plan"].host_s) == 6
     assert tally.stages["plan"].medians_s() == (0.8e-3, 7.5e-3)
@@ -29,6 +30,7 @@ def test_a_run_is_summed_up(fake: Any) -> None:
 
 def test_only_complete_shots_count(fake: Any) -> None:
     tally = Tally(lambda: 0.0)
+    tally.add("run_starting", {"record": fake.run(), "run_dir": "x"})
     rows = [
         fake.row(0, success=False, seen=0, filling=0.99),
         fake.row(1, status="interrupted"),
@@ -37,9 +39,8 @@ def test_only_complete_shots_count(fake: Any) -> None:
     ]
     for row in rows:
         tally.add("shot_finished", {"row": row})
-    assert (tally.n_done, tally.n_defect_free, tally.n_seen) == (2, 0, 1)
-    assert tally.filling.value == 0.99
-    assert math.isnan(tally.filling.error)
+    # a shot that is not judged is no shot with defects
+    assert (tally.n_done, tally.n_judged, tally.n_defect_free, tally.n_seen) == (2, 1, 0, 1)
 
 
 def test_over_budget_is_counted() -> None:

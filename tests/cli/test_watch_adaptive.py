@@ -10,8 +10,9 @@ from rich.console import Console
 
 import labseq
 from labseq.analysis.scanned import ScanRequest
-from labseq.cli.live import Picture, Tally, draw_scan
+from labseq.cli.live import Picture, draw_scan
 from labseq.cli.show import Tables, show_run
+from labseq.cli.tally import Tally
 from labseq.console.arrays import UNICODE
 from labseq.console.events import LogLines, event_text
 from labseq.data.follower import Follower
@@ -102,10 +103,10 @@ def test_a_view_in_another_process_learns_the_points_and_the_best(
         line for line in printed[1] if line.startswith("point ")
     ]
     assert tally.scan is not None
-    points = tally.scan.points()
-    assert [point.n_shots for _, point in points] == [2] * 5
+    points, filling = tally.scan.points(), tally.measured[0]
+    assert [filling.at_points[number].n_shots for _, number in points] == [2] * 5
     assert points[0][0] == "2, 60 ms"
-    assert draw_scan(tally.scan, 48, 8, UNICODE)
+    assert draw_scan(tally.scan, tally.measured, 48, 8, UNICODE)
     console = Console(file=io.StringIO(), width=110, height=40)
     with console.capture() as shown:
         console.print(Picture(tally, [], UNICODE))

@@ -163,7 +163,7 @@ def test_an_archive_holds_the_files_of_the_run(run: Run, tmp_path: Path) -> None
         assert files["sequence.yaml"][()] == (run.path / "sequence.yaml").read_bytes()
         assert files["calibration_sites.json"][()].decode() == '{"kind": "sites", "µ": 1}\n'
         assert files["odd.bin"][()].tobytes() == b"\xff\0"
-        assert files["data/fits.jsonl"][()] == b'{"shot": 0}\n'
+        assert files["analysis/fits.jsonl"][()] == b'{"shot": 0}\n'
         assert archive.attrs["format"] == b"labseq-archive"
 
 

@@ -223,7 +223,7 @@ def device(path: Path) -> None:
     "name",
     [
         *("run.json", "index.jsonl", "STATE", "events.jsonl", "skipped.jsonl"),
-        *("shots/shot_000001.h5", "data/fits.jsonl"),
+        *("shots/shot_000001.h5", "analysis/fits.jsonl"),
     ],
 )
 @pytest.mark.parametrize("make", [pipe, device])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -19,8 +20,9 @@ from .records import make_run, make_shot
 FILE = "shots/shot_000000.h5"
 
 
-def row(**changes: Any) -> IndexRow:
-    return row_of_record(make_shot(**changes), make_run().target, file=FILE, sha256="ab", n_bytes=7)
+def row(measured: Sequence[str] = (), **changes: Any) -> IndexRow:
+    shot, target = make_shot(**changes), make_run().target
+    return row_of_record(shot, target, file=FILE, sha256="ab", n_bytes=7, measured=measured)
 
 
 def test_a_row_has_the_values_of_the_schema() -> None:
@@ -63,11 +65,22 @@ def test_a_damaged_line_is_no_row(damage: dict[str, Any]) -> None:
     assert row_of_line(values | damage) is None
 
 
-@pytest.mark.parametrize("name", [field.name for field in fields(IndexRow)])
+@pytest.mark.parametrize("name", [field.name for field in fields(IndexRow) if field.name != "measured"])
 def test_every_value_is_needed(name: str) -> None:
     values: dict[str, Any] = json.loads(dumps(row()))
     del values[name]
     assert row_of_line(values) is None
+
+
+def test_a_line_of_an_earlier_version_measures_nothing() -> None:
+    values: dict[str, Any] = json.loads(dumps(row(measured=["loading"])))
+    read = row_of_line(values)
+    assert read is not None
+    assert read.measured.keys() == {"loading"}
+    del values["measured"]
+    read = row_of_line(values)
+    assert read is not None
+    assert read.measured == {}
 
 
 def test_a_shot_that_no_line_can_tell_is_refused() -> None:

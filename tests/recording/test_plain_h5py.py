@@ -14,7 +14,7 @@ import pytest
 import labseq
 from labseq.analysis.overview import overview, picture_of
 from labseq.analysis.shot import save_shot, shot_picture
-from labseq.cli.show import ShotRow, shot_table
+from labseq.cli.show import shot_rows, shot_table
 from labseq.cli.summary import Summary
 from labseq.data.images import average_frame, loading_map, signals_of
 
@@ -115,7 +115,8 @@ def test_a_sequence_without_a_target_is_run_shown_and_drawn(tmp_path: Path) -> N
     assert [math.isnan(shot.filling_fraction) for shot in run.shots] == [True, True]
     assert all("not judged" not in line and "defect" not in line for line in Summary.of(run).as_text())
     assert any("on the first image" in line for line in Summary.of(run).as_text())
-    assert "no target" in shot_table([ShotRow.of(shot, run) for shot in run.shots])[1]
+    assert run.shots[0].row.measured.keys() == {"survival:before,after"}
+    assert "survival:before,after" in shot_table(shot_rows(run, run.shots))[0]
     overview(run).save(tmp_path / "overview.png")
     save_shot(tmp_path / "shot.png", shot_picture(run, 0))
 

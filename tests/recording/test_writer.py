@@ -118,6 +118,7 @@ def test_the_index_tells_each_shot_in_a_line(tmp_path: Path) -> None:
         },
         "cycles": {"n_batches": [3, 0, 1], "n_batches_played": [2, 0, 0], "n_atom_moves": [3, 0, 0]},
         "simulation": {},
+        "measured": {},
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "bytes": path.stat().st_size,
     }

@@ -1,0 +1,113 @@
+"""What a run measures: `measure` in a sequence, its defaults, its mistakes, and the values in the index."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import labseq
+from labseq.data.quantities import measured_by
+from labseq.errors import ConfigError
+
+from .whole_runs import SMALL_FRAMES
+
+HEAD = "labseq: 1\nname: m\nseed: 5\nshots: 2\n"
+SURVIVAL = (
+    "shot: [{load: {}}, {name: before, image: {}}, {wait: {duration: 5 s}}, {name: after, image: {}}]\n"
+)
+ARRAY = (
+    "target: {pattern: compact, rows: 5, cols: 5}\n"
+    "shot:\n  - load: {}\n  - image: {}\n  - rearrange: {cycles: 2}\n  - {name: before, image: {}}\n"
+    "  - wait: {duration: 5 s}\n  - {name: after, image: {}}\n"
+)
+SCAN = "scan: {shot.2.wait.duration: [1 s, 2 s]}\n"
+
+
+def opened(tmp_path: Path, text: str) -> labseq.Session:
+    path = tmp_path / "m.yaml"
+    path.write_text(text, "utf-8")
+    return labseq.Session.open(path, output=tmp_path, overrides=SMALL_FRAMES)
+
+
+def message(tmp_path: Path, text: str) -> str:
+    with pytest.raises(ConfigError) as error:
+        opened(tmp_path, text)
+    return str(error.value).removeprefix(f"{tmp_path / 'm.yaml'}:")
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        (HEAD + SURVIVAL, ["survival:before,after"]),
+        (HEAD + ARRAY, ["filling", "defect_free"]),
+        (HEAD + "shot: [{load: {}}, {image: {}}]\n", ["loading"]),
+        (HEAD + "shot: [{load: {}}, {image: {}}, {load: {}}, {name: b, image: {}}]\n", ["loading:b"]),
+        (HEAD + "shot: [{wait: {duration: 1 s}}]\n", []),
+        (HEAD + "measure: ['filling:before@0:10,:']\n" + ARRAY, ["filling:before@0:10,:"]),
+    ],
+)
+def test_without_measure_the_steps_say_it(tmp_path: Path, text: str, names: list[str]) -> None:
+    with opened(tmp_path, text) as session:
+        assert [one["value"] for one in session.assembly.resolved["measure"]] == names
+
+
+def test_some_sites_are_measured(tmp_path: Path) -> None:
+    names = ["survival:before,after@target", "survival:before,after", "loading:before@0:3,2"]
+    with opened(tmp_path, HEAD + f"measure: [{', '.join(map(repr, names))}]\n" + ARRAY) as session:
+        run = session.run()
+    assert list(measured_by(run)) == names
+    for shot in run.shots:
+        before, after = shot.occupancies[-2:]
+        fill = run.target.fill
+        in_target, everywhere, loading = (shot.row.measured[name] for name in names)
+        assert in_target == (np.sum(before & after & fill), np.sum(before & fill))
+        assert everywhere == (np.sum(before & after), np.sum(before))
+        assert loading == (before[:3, 2].mean(), 1)
+        assert in_target[1] < everywhere[1]
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("measure: [survivl]", "5:11: there is no quantity 'survivl' to measure; expected one of survival:"),
+        ("measure: [{value: loading, fot: x}]", "5:28: 'fot' is not a setting"),
+        ("measure: ['survival:before,aftr']", "did you mean 'after'?"),
+        ("measure: [loading@target]", "5:11: there are no sites 'target' (the run has no target) to measure"),
+        (
+            "measure: ['loading@30,:']",
+            "5:11: there are no sites '30,:' (of 20 x 20) to measure; expected target",
+        ),
+        ("measure: [loading@]", "5:11: 'loading@' names no sites after the '@' to measure"),
+        ("measure: [loading@left]", "5:11: 'left' names no sites to measure"),
+        ("measure: []", "5:10: "),
+        ("measure: loading", "5:10: measure is 'loading'"),
+        ("measure: [{value: loading, fit: gausian}]", "5:33: there is no model 'gausian'"),
+        (
+            "measure: [{value: loading, report: decay}]",
+            "5:28: 'report' without a fit; expected 'fit' as well",
+        ),
+        ("measure: [{value: analysis.x.y}]", "the sequence must list the analysis"),
+    ],
+)
+def test_a_mistake_is_named_with_its_place(tmp_path: Path, line: str, expected: str) -> None:
+    text = HEAD + line + "\n" + SURVIVAL
+    assert expected in message(tmp_path, text).replace(";  ", "; ")
+
+
+@pytest.mark.parametrize(
+    ("measure", "expected"),
+    [
+        ("fit: exponential, report: tau", "the model 'exponential' has no parameter 'tau'; expected one of"),
+        ("fit: exponential, parameters: {ofset: 0}", "did you mean 'offset'?"),
+    ],
+)
+def test_a_fit_has_the_parameters_of_its_model(tmp_path: Path, measure: str, expected: str) -> None:
+    text = HEAD.replace("shots: 2\n", "") + SCAN + "measure: [{value: loading, " + measure + "}]\n" + SURVIVAL
+    assert expected in message(tmp_path, text)
+
+
+def test_a_fit_needs_a_scan(tmp_path: Path) -> None:
+    text = HEAD + "measure: [{value: loading, fit: exponential}]\n" + SURVIVAL
+    assert "there is no scan along which to fit; expected 'scan'" in message(tmp_path, text)
