@@ -377,6 +377,23 @@ class CheckFailedError(LabseqError):
         super().__init__(message)
 
 
+class AlarmError(LabseqError):
+    """An alarm has lasted for several shots in a row, and the run was ended.
+
+    Attributes:
+        alarm: Its name in the profile, for example "atoms".
+        n_shots: Number of shots in a row.
+    """
+
+    exit_code: ClassVar[int] = 3
+
+    def __init__(self, alarm: str, text: str, n_shots: int) -> None:
+        self.alarm = alarm
+        self.n_shots = n_shots
+        hint = "its limit is 'alarms' in the profile"
+        super().__init__(f"alarm '{alarm}' in {n_shots} shots in a row ({hint}): {text}")
+
+
 class StopRequested(LabseqError):  # noqa: N818 - a request, not an error
     """The user asked the run to stop; every wait raises it within 50 ms, or it is raised between two shots.
 

@@ -15,11 +15,7 @@ VARIABLES: Final = "variables"
 """Key of the variables, which only expressions use."""
 PROFILE_ROLES: Final = ("camera", "static_tweezers", "mobile_tweezers", "detector", "lines", "simulation")
 """The roles of a profile that are each played by one plugin."""
-MAY_ADD: Final = (
-    "timeouts",
-    "budgets",
-    "calibrations",
-)
+MAY_ADD: Final = ("timeouts", "budgets", "alarms", "calibrations")
 """Keys of the profile whose mappings an override may add."""
 NAMED: Final = ("devices",)
 """Mappings of the profile whose keys are names that the user chose."""

@@ -27,6 +27,7 @@ from labseq.settings import (
     FilePath,
     Folders,
     FormatVersion,
+    Fraction,
     Length,
     Name,
     PositiveDuration,
@@ -283,6 +284,47 @@ class BudgetSettings(Settings):
     write: Duration = Field(default=50e-3, description="writing a shot to the disk")
 
 
+class AlarmSettings(Settings):
+    """Signs in a shot that the machine does not see or move atoms."""
+
+    saturated: Fraction = Field(
+        default=0.05,
+        description="largest share of a frame's pixels that have its highest value; 100 %: no alarm",
+    )
+    frozen: bool = Field(default=True, description="whether two equal frames after one another are an alarm")
+    atoms: Fraction = Field(
+        default=0.02, description="least share of the sites with an atom on the first image; 0: no alarm"
+    )
+    full: int = Field(
+        default=25,
+        ge=0,
+        description="from this number of sites on, an atom on every site of the first image is an alarm; "
+        "0: no alarm",
+    )
+    loading: Fraction = Field(
+        default=0.5,
+        description="least number of loaded atoms, relative to the mean of the last 10 to 20 shots with the "
+        "same settings; 0: no alarm",
+    )
+    confidence: Fraction = Field(
+        default=0.99,
+        description="least confidence of the detector, on average over the sites of an image; 0: no alarm",
+    )
+    arrived: Fraction = Field(
+        default=0.1,
+        description="least share of the atoms moved by the first cycle, of 10 or more, that the next image "
+        "shows where they were moved; 0: no alarm",
+    )
+    clock: Duration = Field(
+        default=10.0, description="largest jump of the computer's clock between two shots"
+    )
+    stop_after: int = Field(
+        default=10,
+        ge=0,
+        description="number of shots in a row with the same alarm after which the run is stopped; 0: never",
+    )
+
+
 class ProfileSpec(Settings):
     """A hardware profile; the settings of its plugins are checked later."""
 
@@ -321,6 +363,9 @@ class ProfileSpec(Settings):
     )
     budgets: Annotated[BudgetSettings, empty_is({})] = Field(
         default=BudgetSettings(), description="time budgets of the computer for its part of a shot"
+    )
+    alarms: Annotated[AlarmSettings, empty_is({})] = Field(
+        default=AlarmSettings(), description="when a shot gives an alarm, and when alarms end a run"
     )
 
     @model_validator(mode="after")

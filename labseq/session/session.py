@@ -18,14 +18,16 @@ from labseq.data import Run, open_run
 from labseq.errors import ConfigError, DeviceError, RecordingError
 from labseq.guard import stop_on_signals
 from labseq.messages import error_text, visible
-from labseq.model import RunRecord
+from labseq.model import RunRecord, ShotRecord
 from labseq.realtime import real_time
 from labseq.recording import RunWriter, clear_active, data_root, find_dead_run, mark_active
 from labseq.recording.folders import later_day
+from labseq.recording.index import IndexRow
 from labseq.roles import RunObserver
 from labseq.safety.locks import lock_devices
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer, State
+from labseq.session.alarms import Alarms
 from labseq.session.check import check
 from labseq.session.checks import Checks
 from labseq.session.prepared import PreparedRun
@@ -70,17 +72,24 @@ class Shots:
         self._run = run
         self._point = first
         self._writer = writer
+        self._alarms = Alarms(run.assembly.hardware.profile.alarms, run.warn)
         self.sequencer = Sequencer(
             lab,
             first.steps,
             run.stop_flag,
-            writer,
+            self,
             run.observers,
             seed=run.seed,
             policy=run.assembly.policy,
             parameters=self._parameters(first),
             watchdog=watchdog,
         )
+
+    def write_shot(self, shot: ShotRecord) -> IndexRow:
+        """Write a shot, and look for alarms while its frames are there."""
+        row = self._writer.write_shot(shot)
+        self._alarms.look(shot)
+        return row
 
     def take_all(self, checks: Checks) -> None:
         """Take the shots until none is left, or the points end.
@@ -91,6 +100,7 @@ class Shots:
         Raises:
             StopRequested: The run was asked to end.
             CheckFailedError: A value is outside the limits of a check that stops the run.
+            AlarmError: An alarm has lasted too long.
             LabseqError: Another error that ended the run before its last shot.
         """
         points, history = self._run.points, self._run.history
@@ -106,6 +116,7 @@ class Shots:
             history.add(self._writer.run_dir, self._writer.last_row)
             if why := failure or checks.after(self._writer.last_row):
                 self._skip([*([shot] if failure else []), *history.later_at_its_point(shot)], why)
+            self._alarms.raise_if_lasting()
 
     def _move_to(self, point: Point) -> None:
         """Change what differs between the present point and the next."""

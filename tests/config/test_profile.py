@@ -142,7 +142,7 @@ def test_a_wrong_option_is_named_in_full(address: str, value: str, message: str)
 
 WRONG = """
 static_tweezers: => static_tweezer:
-  12:1: 'static_tweezer' is not a setting of a hardware profile; expected one of labseq, name, grid, camera, static_tweezers, mobile_tweezers, detector, devices, lines, simulation, equalise, calibrations, plugin_folders, variables, timeouts, budgets; did you mean 'static_tweezers'?
+  12:1: 'static_tweezer' is not a setting of a hardware profile; expected one of labseq, name, grid, camera, static_tweezers, mobile_tweezers, detector, devices, lines, simulation, equalise, calibrations, plugin_folders, variables, timeouts, budgets, alarms; did you mean 'static_tweezers'?
 camera: {use: virtual, readout: 5 ms}⏎ => ∅
   2:1: 'camera' is missing (the camera's plugin)
 camera: {use: virtual, readout: 5 ms} => camera: virtual

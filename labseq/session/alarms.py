@@ -1,0 +1,151 @@
+"""Alarms: signs in a shot that the machine does not see or move atoms, which no check of a sequence asks for.
+
+A camera that sees nothing, a laser that is off or a stage that does not move give shots that look complete.
+Each alarm warns when it begins; after some shots in a row it ends the run, so that a night is not lost.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.config.profile import AlarmSettings
+from labseq.errors import AlarmError
+from labseq.messages import clean
+from labseq.model import ShotRecord, follow_atoms
+from labseq.units import format_quantity
+
+COMPARED: Final = 20
+"""Maximum number of earlier shots whose loading a shot is compared with."""
+LEAST_COMPARED: Final = 10
+"""Minimum number: the mean of fewer is too uncertain."""
+LEAST_MOVED: Final = 10
+"""Minimum number of atoms that a cycle moves to judge whether they arrived."""
+
+
+class Alarms:
+    """Looks at each shot of a run.
+
+    Args:
+        settings: The limits.
+        warn: Receives the message when an alarm begins.
+        wall_s: The computer's clock, which a user or a network may set.
+        monotonic_s: A clock that nobody sets, and that stands still while the computer sleeps.
+    """
+
+    def __init__(
+        self,
+        settings: AlarmSettings,
+        warn: Callable[[str], None],
+        wall_s: Callable[[], float] = time.time,
+        monotonic_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._settings = settings
+        self._warn = warn
+        self._clocks = wall_s, monotonic_s
+        self._difference_s = wall_s() - monotonic_s()
+        self._in_a_row: dict[str, int] = {}
+        self._texts: dict[str, str] = {}
+        self._frame: NDArray[np.uint16] | None = None
+        self._loadings: dict[str, deque[int]] = {}
+
+    def look(self, shot: ShotRecord) -> None:
+        """Look at a shot that was taken; attempts that did not complete are left out."""
+        if shot.status != "complete":
+            return
+        found = dict(self._signs(shot))
+        self._in_a_row = {name: self._in_a_row.get(name, 0) + 1 for name in found}
+        self._texts = found
+        for name, text in found.items():
+            if self._in_a_row[name] == 1:
+                self._warn(f"shot {shot.shot_index}: alarm '{name}': {text}")
+
+    def raise_if_lasting(self) -> None:
+        """End the run if an alarm has lasted too long.
+
+        Raises:
+            AlarmError: It has.
+        """
+        limit = self._settings.stop_after
+        for name, n in self._in_a_row.items():
+            if limit and n >= limit:
+                raise AlarmError(name, self._texts[name], n)
+
+    def _signs(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
+        """Name and text of each alarm that a shot gives."""
+        yield from self._frames(shot)
+        yield from self._first_image(shot)
+        yield from self._detection(shot)
+        yield from self._moves(shot)
+        yield from self._clock()
+
+    def _frames(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
+        # the first and the last image tell it, and the others of a long shot would take time
+        for image in (*shot.images[:1], *shot.images[1:][-1:]):
+            if image.frame is None:
+                continue
+            frame, before, which = image.frame.image, self._frame, f"image '{clean(image.name)}'"
+            self._frame = frame
+            highest = int(frame.max())
+            share = np.count_nonzero(frame == highest) / frame.size
+            if share > self._settings.saturated:
+                what = (
+                    f"{100 * share:.3g} % of the pixels of {which} have its highest value, {highest} counts"
+                )
+                yield "saturated", f"{what}; check the light, the gain, and whether the camera sees at all"
+            if self._settings.frozen and before is not None and np.array_equal(frame, before):
+                what = f"{which} is the same as the one before, pixel by pixel"
+                yield "frozen", f"{what}; the camera or its driver delivers an old frame"
+
+    def _first_image(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
+        """Loading: none, everywhere, or far less than in the shots before at the same settings."""
+        if not shot.images:
+            return
+        occupancy, settings = shot.images[0].occupancy, self._settings
+        n_atoms = int(np.count_nonzero(occupancy))
+        if n_atoms < settings.atoms * occupancy.size:
+            what = f"{_atoms(n_atoms)} on the first image, at {occupancy.size} sites"
+            yield "atoms", f"{what}; check the source of atoms, the tweezers and the camera"
+        if settings.full and n_atoms == occupancy.size >= settings.full:
+            what = f"all {n_atoms} sites are full on the first image"
+            yield "full", f"{what}; check the thresholds and the light"
+        others = self._loadings.setdefault(repr(shot.parameters), deque[int](maxlen=COMPARED))
+        if len(others) >= LEAST_COMPARED and n_atoms < settings.loading * (mean := float(np.mean(others))):
+            yield "loading", f"{_atoms(n_atoms)} loaded, {mean:.3g} on average in the shots before"
+        others.append(n_atoms)
+
+    def _detection(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
+        confidences = [float(np.nanmean(image.confidence)) for image in shot.images if image.cycle < 0]
+        lowest = min(confidences, default=1.0)
+        if lowest < self._settings.confidence:
+            what = f"by its own account the detector is right at only {100 * lowest:.3g} % of the sites"
+            yield "confidence", f"{what}; do the thresholds fit the gain and the exposure?"
+
+    def _moves(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
+        """Whether the atoms that the first cycle moved are seen where it moved them."""
+        for before, after in pairwise(shot.images) if shot.cycles else ():
+            cycle = shot.cycles[0]
+            if (after.step, after.cycle) == (cycle.step, cycle.cycle):
+                moved, _ = follow_atoms(before.occupancy, [cycle])
+                n_moved, n_seen = np.count_nonzero(moved), np.count_nonzero(moved & after.occupancy)
+                if n_moved >= LEAST_MOVED and n_seen < self._settings.arrived * n_moved:
+                    what = f"{n_seen} of {n_moved} moved atoms arrived"
+                    yield "arrived", f"{what}; check light, trigger and overlay of the mobile tweezers"
+
+    def _clock(self) -> Iterator[tuple[str, str]]:
+        wall_s, monotonic_s = self._clocks
+        difference_s = wall_s() - monotonic_s()
+        jump_s, self._difference_s = difference_s - self._difference_s, difference_s
+        if abs(jump_s) > self._settings.clock:
+            what = f"the computer's clock has jumped by {format_quantity(jump_s, 'time')}"
+            yield "clock", f"{what}: it was set, or the computer slept"
+
+
+def _atoms(n: int) -> str:
+    return f"{n} atom{'s' * (n != 1)}"

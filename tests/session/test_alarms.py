@@ -1,0 +1,152 @@
+"""Alarms: each sign that the machine does not see or move atoms, alone and in runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import labseq
+from labseq.config.profile import AlarmSettings
+from labseq.errors import AlarmError
+from labseq.model import Frame, ImageRecord, ShotRecord
+from labseq.session.alarms import Alarms
+from labseq.testing.fakes import RecordingObserver
+
+from .whole_runs import SMALL_FRAMES
+
+RNG = np.random.default_rng(7)
+SHAPE = (6, 6)
+
+
+def frame(noise: float = 5.0) -> np.ndarray[Any, Any]:
+    return RNG.normal(500.0, noise, (40, 40)).astype(np.uint16)
+
+
+def image(n_atoms: int = 27, confidence: float = 1.0, counts: Any = None) -> ImageRecord:
+    occupancy = (np.arange(36) < n_atoms).reshape(SHAPE)
+    pixels = Frame(frame() if counts is None else counts, 0.01, 0.0)
+    return ImageRecord(pixels, occupancy, np.full(SHAPE, confidence, np.float32), 1, -1, 0.0, 0.01)
+
+
+class Watched:
+    """Alarms whose warnings are kept, with clocks that a test sets."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.warnings: list[str] = []
+        self.wall_s = self.monotonic_s = 0.0
+        clocks = lambda: self.wall_s, lambda: self.monotonic_s
+        self.alarms = Alarms(AlarmSettings(**settings), self.warnings.append, *clocks)
+        self.n = 0
+
+    def shot(self, *images: ImageRecord, status: Any = "complete") -> list[str]:
+        """Look at a shot; returns the names of the alarms that began."""
+        record, n_before = ShotRecord(self.n, 0, 1, ""), len(self.warnings)
+        record.images, record.status = list(images), status
+        self.n += 1
+        self.alarms.look(record)
+        return [text.split("'")[1] for text in self.warnings[n_before:]]
+
+
+@pytest.mark.parametrize(
+    ("bad", "names"),
+    [
+        (image(counts=np.full((40, 40), 65535, np.uint16)), ["saturated"]),
+        (image(counts=np.minimum(frame(50.0), 550)), ["saturated"]),
+        (image(0), ["atoms"]),
+        (image(36), ["full"]),
+        (image(confidence=0.98), ["confidence"]),
+    ],
+)
+def test_one_image_gives_its_alarm(bad: ImageRecord, names: list[str]) -> None:
+    watched = Watched()
+    assert watched.shot(image(), image()) == []
+    assert watched.shot(bad) == names
+    assert watched.shot(image()) == []
+
+
+def test_an_old_frame_is_an_alarm() -> None:
+    watched, pixels = Watched(), frame()
+    assert watched.shot(image(counts=pixels)) == []
+    assert watched.shot(image(counts=pixels.copy())) == ["frozen"]
+    assert watched.shot(image(), image()) == []
+
+
+def test_a_loading_far_below_its_mean_is_an_alarm() -> None:
+    watched = Watched()
+    for n_atoms in (27, 24, 29, 26, 25, 28, 27, 26, 30):
+        assert watched.shot(image(n_atoms)) == []
+    assert watched.shot(image(13)) == []  # nine shots are too few to compare with
+    assert watched.shot(image(12)) == ["loading"]
+    assert watched.shot(image(14)) == []
+
+
+def test_a_clock_that_jumps_is_an_alarm() -> None:
+    watched = Watched()
+    watched.wall_s = watched.monotonic_s = 100.0
+    assert watched.shot(image()) == []
+    watched.wall_s += 3600.0  # the computer slept, or its clock was set
+    assert watched.shot(image()) == ["clock"]
+    assert "jumped by 1 h" in watched.warnings[-1] or "3600 s" in watched.warnings[-1]
+    assert watched.shot(image()) == []
+
+
+def test_an_alarm_warns_once_and_ends_the_run_after_some_shots_in_a_row() -> None:
+    watched = Watched(stop_after=3)
+    for _ in range(2):
+        watched.shot(image(0))
+        watched.alarms.raise_if_lasting()
+    watched.shot(image(0), status="failed")  # does not count
+    watched.alarms.raise_if_lasting()
+    watched.shot(image(0))
+    assert len(watched.warnings) == 1
+    with pytest.raises(AlarmError, match=r"alarm 'atoms' in 3 shots in a row .*: 0 atoms on the first image"):
+        watched.alarms.raise_if_lasting()
+
+
+def test_every_limit_can_be_switched_off() -> None:
+    off: dict[str, Any] = {"saturated": 1, "frozen": False, "atoms": 0, "full": 0, "confidence": 0}
+    watched, pixels = Watched(**off), np.full((40, 40), 65535, np.uint16)
+    assert watched.shot(image(0, 0.5, pixels), image(36, 0.5, pixels)) == []
+
+
+def run(tmp_path: Path, n_shots: int, *overrides: str) -> tuple[list[str], BaseException | None, Path]:
+    observer, error = RecordingObserver(), None
+    with labseq.Session.open(
+        "sequences/compact_225.yaml",
+        shots=n_shots,
+        seed=3,
+        overrides=[*SMALL_FRAMES, "shot.2.rearrange.cycles=1", *overrides],
+        output=tmp_path,
+        observer=observer,
+    ) as session:
+        try:
+            session.run()
+        except AlarmError as failure:
+            error = failure
+        assert session.run_dir is not None
+    warnings = [values["text"] for name, values in observer.events if name == "warning"]
+    return [text for text in warnings if "alarm" in text], error, session.run_dir
+
+
+def test_a_good_run_has_no_alarm(tmp_path: Path) -> None:
+    assert run(tmp_path, 20)[:2] == ([], None)
+
+
+def test_a_run_without_atoms_ends_and_can_be_resumed(tmp_path: Path) -> None:
+    warnings, error, folder = run(
+        tmp_path, 12, "profile.simulation.loading=0%", "profile.alarms.stop_after=4"
+    )
+    assert [text.split("'")[1] for text in warnings] == ["atoms"]
+    assert isinstance(error, AlarmError)
+    assert error.exit_code == 3
+    stopped = labseq.open_run(folder)
+    assert (len(stopped.shots), stopped.status) == (4, "failed")
+    assert "alarm 'atoms' in 4 shots in a row" in stopped.error
+
+
+def test_moved_atoms_that_do_not_arrive_are_an_alarm(tmp_path: Path) -> None:
+    warnings, _, _ = run(tmp_path, 1, "profile.mobile_tweezers.speed=2000 um/ms")
+    assert any("'arrived'" in text and "moved atoms arrived" in text for text in warnings)
