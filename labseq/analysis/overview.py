@@ -30,6 +30,7 @@ from labseq.analysis.charts import (
 )
 from labseq.analysis.scanned import (
     ScanRequest,
+    own_fits,
     scan_report,
     shown_unit,
     title_of,
@@ -402,9 +403,14 @@ class _Summary:
 def _quantity_row(summary: _Summary, name: str) -> Row:
     """A quantity against shot, cycle and scanned value, where available."""
     quantity = summary.quantity(name)
-    maps = scan_panels(summary.scan, quantity) if summary.scan is not None else ()
+    scan, run = summary.scan, summary.run
+    maps = (
+        ()
+        if scan is None
+        else scan_panels(scan, quantity, own_fits(run, scan, quantity, scan.over(quantity)))
+    )
     by_cycle = cycles_panel(quantity, summary.statistics) if name in WITH_TARGET else None
-    shots = summary.run.shots
+    shots = run.shots
     values = np.array([quantity.of_shot(shot) for shot in shots])
     indices = np.array([float(shot.index) for shot in shots])
     unit, factor = shown_unit(quantity, values.tolist())

@@ -12,7 +12,14 @@ from labseq.console.text import count_of
 from labseq.data import Run
 from labseq.data.columns import Column, make_column
 from labseq.data.points import ScanPoint
-from labseq.data.quantities import Quantity, description_of, find_quantity, measured_by, quantity_of
+from labseq.data.quantities import (
+    Quantity,
+    description_of,
+    find_quantity,
+    measured_by,
+    measures_of,
+    quantity_of,
+)
 from labseq.data.scanned import FitAt, FitRequest, Scanned, fits_along, scanned
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
@@ -86,7 +93,7 @@ class ScanReport:
             tables = self.table()
         if not axes:
             tables = ["the run has no scan: these are all its shots", "", *tables]
-        return [*tables, *(line for fits in self.fits for line in ("", *fit_lines(fits)))]
+        return [*tables, *(line for fits in self.fits if fits for line in ("", *fit_lines(fits)))]
 
     def table(self, most: int = 0) -> list[str]:
         """A row for each point.
@@ -132,8 +139,9 @@ class ScanReport:
         ]
         names = [quantity.name for quantity, _ in self.values]
         fits = {
-            name: fits if fits[0].values else fits[0].fit
+            name: fits if fits[0].values else fits[0].fit or fits[0]
             for name, fits in zip(names, self.fits, strict=False)
+            if fits
         }
         return {"points": points} | ({"fits": fits} if fits else {})
 
@@ -182,12 +190,40 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
         if all(math.isnan(mean.value) for mean in means):
             raise ConfigError(Problem(f"no shot has a value of '{quantity.name}'", clean(run.path.name)))
     fit = request.fit
-    fits = (
-        ()
-        if fit is None
-        else tuple(fits_along(run, scan, quantity, means, fit) for quantity, means in values)
-    )
+    fits: tuple[list[FitAt], ...] = ()
+    if fit is not None:
+        fits = tuple(fits_along(run, scan, quantity, means, fit) for quantity, means in values)
+    elif not request.names:
+        fits = tuple(own_fits(run, scan, quantity, means) for quantity, means in values)
     return ScanReport(scan, values, fits)
+
+
+def own_fits(run: Run, scan: Scanned, quantity: Quantity, means: Sequence[Estimated]) -> list[FitAt]:
+    """The fits of a quantity that the run's sequence asks for; a fit that fails is a problem in them."""
+    wanted = next((one for one in measures_of(run) if one["value"] == quantity.name and "fit" in one), None)
+    if wanted is None or not scan.axes:
+        return []
+    try:
+        request = FitRequest(wanted["fit"], wanted.get("parameters", {}))
+        return fits_along(run, scan, quantity, means, request)
+    except ConfigError as error:
+        problem = "; ".join(problem.what for problem in error.problems)
+        return [FitAt({}, {}, None, f"no fit {wanted['fit']}: {problem}")]
+
+
+def results_of(run: Run, report: ScanReport) -> list[tuple[str, str]]:
+    """The results of a run: name and value of the parameter that its sequence asks for, in each fit."""
+    reported = {one["value"]: one.get("report") for one in measures_of(run)}
+    rows: list[tuple[str, str]] = []
+    for (quantity, _), fits in zip(report.values, report.fits, strict=False):
+        for at in fits:
+            name = reported.get(quantity.name) or (next(iter(at.fit.free), "") if at.fit else "")
+            if at.fit is not None and name in at.fit.parameters:
+                where = "".join(f", {word}" for word in at.written.values())
+                rows.append((f"{name}{where}", str(at.fit.parameters[name])))
+            elif at.problem:
+                rows.append((title_of(quantity), at.problem))
+    return rows
 
 
 def _aim(run: Run) -> tuple[str, ...]:
@@ -199,6 +235,8 @@ def _aim(run: Run) -> tuple[str, ...]:
 def fit_lines(fits: Sequence[FitAt]) -> list[str]:
     """A fit with a line for each parameter; several as a table, with the reasons of those that failed."""
     made = [at.fit for at in fits if at.fit is not None]
+    if not made:
+        return [fits[0].problem]
     if not fits[0].values:
         return made[0].lines()
     names = list(dict.fromkeys(name for fit in made for name in fit.free))

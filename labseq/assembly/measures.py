@@ -69,7 +69,7 @@ def _check_fit(document: Document, sequence: SequenceSpec, place: Loc, measure: 
     Raises:
         ConfigError: There is no such model or parameter, or no scan.
     """
-    from labseq.data.fits import MODELS  # most runs fit nothing
+    from labseq.data.fit_models import MODELS  # most runs fit nothing
 
     def error(key: str, what: str, expected: str, hint: str = "") -> ConfigError:
         return document.error((*place, key), what, expected, hint)

@@ -13,6 +13,7 @@ from labseq.analysis.scanned import (
     ScanRequest,
     counted_text,
     rate_text,
+    results_of,
     scan_report,
     share_text,
     title_of,
@@ -69,7 +70,8 @@ class Summary:
         has_target: Whether the sequence has a target.
         n_atoms: Mean number of atoms on the first and on the last image; none without images.
         measured: What the run measures, each with its mean over all shots.
-        scan: Filling and defect-free fraction at each point of the scan.
+        scan: What the run measures at each point of the scan, with its fits.
+        results: Name and value of what the sequence asks the fits for.
         best: The best point of an adaptive scan.
         wall_time_s: Time until the end of the last shot; of a resumed run, of all its parts together.
         watchdog: What the watchdog did.
@@ -91,6 +93,7 @@ class Summary:
     n_atoms: Sequence[Estimate] = ()
     measured: Sequence[tuple[Quantity, Estimated]] = ()
     scan: ScanReport | None = None
+    results: Sequence[tuple[str, str]] = ()
     best: BestPoint | None = None
     wall_time_s: float = math.nan
     watchdog: Sequence[str] = ()
@@ -99,6 +102,7 @@ class Summary:
     @classmethod
     def of(cls, run: Run) -> Summary:
         """The result of a run, so far."""
+        scan = None if scanned(run) is None else scan_report(run, ScanRequest())
         return cls(
             run_dir=run.path,
             shots=len(run.shots),
@@ -114,7 +118,8 @@ class Summary:
             has_target=not run.target.is_none,
             n_atoms=_n_atoms(run),
             measured=[(one := quantity_of(run, name), one.over(run.shots)) for name in measured_by(run)],
-            scan=None if scanned(run) is None else scan_report(run, ScanRequest()),
+            scan=scan,
+            results=results_of(run, scan) if scan else (),
             best=best_point(run),
             wall_time_s=_wall_time_s(run),
             watchdog=watchdog_lines(run.path),
@@ -130,6 +135,7 @@ class Summary:
         """All attributes; of the scan, its points stand beside them."""
         values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "scan"}
         values["measured"] = {quantity.name: mean for quantity, mean in self.measured}
+        values["results"] = dict(self.results)
         return values | (self.scan.as_json() if self.scan else {})
 
     def as_text(self) -> list[str]:
@@ -153,6 +159,7 @@ class Summary:
             *_best_rows(self.best),
             *(statistics_rows(self.statistics) if self.has_target else _atom_rows(self.n_atoms)),
             *_measured_rows(self.measured),
+            *((clean(name), value) for name, value in self.results),
             ("wall time", _wall_time(self.wall_time_s)),
             *(("watchdog", clean(line)) for line in self.watchdog),
             *([("warning", damaged)] if self.n_damaged_lines else []),

@@ -229,6 +229,11 @@ WITHOUT_TARGET: Final = ("n_loaded", "n_atoms")
 """What a run of an earlier version is taken to measure, with a target and without one."""
 
 
+def measures_of(run: Run) -> Sequence[Mapping[str, Any]]:
+    """What a run measures, as its sequence says it: "value", and where given "fit", "report", "parameters"."""
+    return (run.record.get("resolved") or {}).get("measure") or ()
+
+
 def measured_by(run: Run) -> tuple[str, ...]:
     """Names of the quantities that a run measures, the most important first."""
     return names_measured(run.record.get("resolved") or {}, run.target)
@@ -307,7 +312,7 @@ def _values_for_conditions(run: Run, name: str) -> tuple[Callable[[Shot], Any], 
         values = columns[name].values
         of_shot = dict(zip((shot.index for shot in run.shots), values.tolist(), strict=True))
         return lambda shot: of_shot[shot.index], values.dtype == object
-    if split_name(name)[0] not in OF_IMAGES:
+    if parse_name(name).kind not in OF_IMAGES:
         near = closest(name, [*columns, *OF_IMAGES])
         raise ConfigError(
             Problem(

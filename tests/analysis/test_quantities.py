@@ -16,9 +16,9 @@ from labseq.data.fit_models import MODELS, RB87_U
 from labseq.data.fits import fit_points
 from labseq.data.points import scan_points
 from labseq.data.quantities import select_shots
-from labseq.model.image_quantities import OF_IMAGES
 from labseq.errors import ConfigError
 from labseq.model.estimate import Estimate, Estimated, Rate
+from labseq.model.image_quantities import OF_IMAGES
 
 from .records import Write, make_shot
 
