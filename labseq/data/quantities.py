@@ -230,7 +230,7 @@ WITHOUT_TARGET: Final = ("n_loaded", "n_atoms")
 
 
 def measures_of(run: Run) -> Sequence[Mapping[str, Any]]:
-    """What a run measures, as its sequence says it: "value", and where given "fit", "report", "parameters"."""
+    """What a run measures, as its sequence says it: "value", and as given "fit", "report", "parameters"."""
     return (run.record.get("resolved") or {}).get("measure") or ()
 
 
