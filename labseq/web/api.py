@@ -17,17 +17,19 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 import labseq
 from labseq.analysis.statistics import statistics_of
 from labseq.analysis.timing import StageTotals
+from labseq.console.events import scanned_names, scanned_values
 from labseq.errors import RecordingError
 from labseq.files import read_file
 from labseq.plain import to_plain
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import read_state
 from labseq.web.endpoint import Endpoint, describe, in_thread
-from labseq.web.history import finite
+from labseq.web.history import Columns
 from labseq.web.live import MAX_VIEWERS, Live
 from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
+from labseq.web.series import finite
 from labseq.web.shots import frame_png, readings_of, shot_values
-from labseq.web.state import N_BINS, Limits, figures_of, head_of, losses_of, scan_values, stage_rows
+from labseq.web.state import N_BINS, Limits, figures_of, head_of, losses_of, stage_rows
 from labseq.web.store import calibration_picture, calibrations, queue_values
 
 BASE: Final = "/api/v1"
@@ -57,12 +59,12 @@ class Api:
         reading = [
             Endpoint("/server", self.server),
             Endpoint("/now", self.now),
-            Endpoint("/events", self.events, ("day", "name"), "text/event-stream"),
+            Endpoint("/events", self.events, ("day", "name", "quantity"), "text/event-stream"),
             Endpoint("/runs", self.runs, ("q", "status", "first", "n")),
             Endpoint(_RUN, self.run),
             Endpoint(f"{_RUN}/state", self.state),
             Endpoint(f"{_RUN}/statistics", self.statistics),
-            Endpoint(f"{_RUN}/scan", self.scan),
+            Endpoint(f"{_RUN}/scan", self.scan, ("quantity",)),
             Endpoint(f"{_RUN}/shots", self.shots, ("first", "n")),
             Endpoint(f"{_RUN}/shots/{{shot}}", self.shot, ("attempt",)),
             Endpoint(
@@ -96,9 +98,8 @@ class Api:
         """
         if self._live.n_viewers >= MAX_VIEWERS:
             return JSONResponse({"error": f"{MAX_VIEWERS} pages are open already"}, 503)
-        channel = self._live.channel(
-            request.query_params.get("day", ""), request.query_params.get("name", "")
-        )
+        query = request.query_params
+        channel = self._live.channel(query.get("day", ""), query.get("name", ""), _quantity(request))
         states = channel.states(request.headers.get("last-event-id", ""))
         headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
         return StreamingResponse(states, media_type="text/event-stream", headers=headers)
@@ -110,7 +111,7 @@ class Api:
         return self._runs.search(query.get("q", "")[:200], query.get("status", "")[:20], first, most)
 
     def run(self, request: Request) -> Any:
-        """A run: its head, figures, trend, losses, what was changed, and its files."""
+        """A run: its head, figures, what it measures with trends, losses, what was changed, its files."""
         run = self._opened(request)
         record, (status, error) = run.record, read_state(run.folder)
         run.history.update()
@@ -119,7 +120,7 @@ class Api:
         return {
             "run": head_of(run, record, status, error),
             "figures": figures_of(columns),
-            "trend": columns.trend(N_BINS),
+            "measured": columns.shown(N_BINS),
             "losses": losses_of(columns),
             "changes": readings_of({address: change["written"] for address, change in changes.items()}),
             "calibrations": readings_of(record.get("calibrations") or {}),
@@ -161,11 +162,12 @@ class Api:
         }
 
     def scan(self, request: Request) -> Any:
-        """The points of a run's scan and the figures at each; null without a scan."""
+        """The points of a run's scan, with what it measures or `quantity`, and its fit; null without a scan.
+
+        Shots whose files have not been read for the quantity yet are counted as `n_unread`: ask again.
+        """
         run = self._opened(request)
-        run.history.update()
-        run.read_events()
-        return scan_values(run) if run.record.get("scan") else None
+        return self._live.state_of(run).scan(_quantity(request), most_s=8.0)
 
     def shots(self, request: Request) -> Any:
         """The shots of a run, the newest first, with attempts that do not count."""
@@ -175,17 +177,27 @@ class Api:
         most = min(MAX_LISTED, _number(request.query_params, "n", 50))
         columns = run.history.columns()
         lines = range(len(columns.shot))[::-1][first : first + most]
+        scan: dict[str, Any] = run.record.get("scan") or {}
+        return {
+            "n_lines": len(columns.shot),
+            "scanned": [text_of(name, 60) for name in scanned_names(scan)],
+            "measured": columns.means(),
+            "shots": [self._row(run, columns, line, scan) for line in lines],
+        }
+
+    @staticmethod
+    def _row(run: OpenRun, columns: Columns, line: int, scan: Mapping[str, Any]) -> dict[str, Any]:
         names = ("success", "filling", "seen", "n_cycles", "n_batches", "n_atom_moves", "duration_s")
-        rows = [
-            {
-                "shot": int(columns.shot[line]),
-                "attempt": int(columns.attempt[line]),
-                "counts": bool(columns.counts[line]),
-                **{name: finite(float(columns.numbers[name][line])) for name in names},
-            }
-            for line in lines
-        ]
-        return {"n_lines": len(columns.shot), "shots": rows}
+        row = run.history.row(line)
+        return {
+            "shot": row.shot,
+            "attempt": row.attempt,
+            "counts": row.counts,
+            **{name: finite(float(columns.numbers[name][line])) for name in names},
+            "n_defects": row.images.n_defects[-1] if len(row.images) and not run.target.is_none else None,
+            "scanned": [text_of(word, 60) for word in scanned_values(scan, row.shot, row.parameters)],
+            "measured": [finite(series.value(line)) for series in columns.series],
+        }
 
     def shot(self, request: Request) -> Any:
         """A shot: images with occupancies, cycle by cycle moves, stages and readings."""
@@ -322,6 +334,10 @@ def _number(values: Mapping[str, Any], name: str, default: int) -> int:
     if not (text.removeprefix("-").isdecimal() and len(text) < 12):
         raise NoSuchRun(f"'{name}' is not a whole number")
     return max(int(text), -1)
+
+
+def _quantity(request: Request) -> str:
+    return request.query_params.get("quantity", "")[:200]
 
 
 def _evenly(items: Any, n_most: int) -> list[Any]:

@@ -28,6 +28,8 @@ _DESCRIPTIONS: Final = {
     "shot": "index of the shot, from 0",
     "image": "index of the image in the shot, from 0",
     "attempt": "an attempt that does not count; by default the one that counts",
+    "quantity": "what to show at the points of the scan: survival:before,after@target; by default what the "
+    "run measures",
     "q": "words that date, name, profile, outcome, comment or tags must contain",
     "status": "running, complete, stopped, failed or damaged",
     "first": "number of rows to leave out",

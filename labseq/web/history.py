@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from datetime import datetime
 from pathlib import Path
 from threading import Lock
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.analysis.statistics import LOST
+from labseq.data import Shot
 from labseq.data.follower import Follower
 from labseq.errors import RecordingError
 from labseq.files import lines_in
@@ -22,6 +23,7 @@ from labseq.model.estimate import Estimate, Rate, mean
 from labseq.plain import parse_object
 from labseq.recording.folders import INDEX_FILE
 from labseq.recording.index import IndexRow, row_of_line
+from labseq.web.series import Series, about_quantity, finite, interval_of, mean_values
 
 _NUMBERS: Final[Mapping[str, Callable[[IndexRow], float]]] = {
     "success": lambda row: math.nan if row.success is None else row.success,
@@ -44,11 +46,14 @@ class RunHistory:
     Args:
         run_dir: The run's folder.
         follower: Reads what is added to the index.
+        series_of: Makes the series of what the page of the run shows.
     """
 
-    def __init__(self, run_dir: Path, follower: Follower) -> None:
+    def __init__(self, run_dir: Path, follower: Follower, series_of: Callable[[], list[Series]]) -> None:
         self._path = run_dir / INDEX_FILE
         self._follower = follower
+        self._series_of = series_of
+        self._series: list[Series] | None = None
         self._lock = Lock()
         self._shot, self._attempt, self._start = array("q"), array("q"), array("q")
         self._numbers = {name: array("d") for name in _NUMBERS}
@@ -61,14 +66,21 @@ class RunHistory:
         """Read the lines that were added.
 
         Raises:
-            RecordingError: The file cannot be read.
+            RecordingError: The file, or run.json, cannot be read.
         """
         with self._lock:
+            if self._series is None:
+                self._series = self._series_of()
             for start, row in self._follower.lines():
                 if row is None:
                     self.n_damaged += 1
                 else:
                     self._add(row, start)
+            for series in self._series:
+                series.read(self._shot_of)
+
+    def _shot_of(self, line: int) -> Shot:
+        return self._follower.shot(self._row(line))
 
     def _add(self, row: IndexRow, start: int) -> None:
         n = len(self._shot)
@@ -76,6 +88,8 @@ class RunHistory:
             if (older := self._line_of.get(row.shot)) is not None:
                 self._counts[older] = 0
             self._line_of[row.shot] = n
+        for series in self._series or ():
+            series.add(row)
         self._counts.append(row.counts)
         self._shot.append(row.shot)
         self._attempt.append(row.attempt)
@@ -106,12 +120,23 @@ class RunHistory:
             RecordingError: It cannot be read.
         """
         with self._lock:
-            start = self._start[line]
-        values = parse_object(next(lines_in(self._path, start), b""))
-        row = None if values is None else row_of_line(values)
+            return self._row(line)
+
+    def _row(self, line: int) -> IndexRow:
+        row = _row_of(next(lines_in(self._path, self._start[line]), b""))
         if row is None:
             raise RecordingError(self._path, "has a damaged line", "`labseq doctor` reports them")
         return row
+
+    def rows(self, first: int) -> Generator[IndexRow]:
+        """The rows of the index from a line on, read from the file.
+
+        Raises:
+            RecordingError: It cannot be read.
+        """
+        if first < len(self):
+            readable = (row for text in lines_in(self._path, self._start[first]) if (row := _row_of(text)))
+            yield from itertools.islice(readable, len(self) - first)
 
     def line_of(self, shot: int, attempt: int | None = None) -> int | None:
         """The line of a shot that counts, or of one attempt; None if there is none."""
@@ -131,6 +156,7 @@ class RunHistory:
                 np.array(self._counts, np.bool_),
                 {name: np.array(column) for name, column in self._numbers.items()},
                 {name: np.array(column) for name, column in self._lost.items()},
+                tuple(self._series or ()),
             )
 
 
@@ -143,6 +169,7 @@ class Columns:
         counts: bool (n_lines,), whether it completed the shot.
         numbers: Name -> float64 (n_lines,), nan where it is unknown.
         lost: Cause -> float64 (n_lines,), atoms that a simulation lost.
+        series: The quantities that the page of the run shows, the most important first.
     """
 
     def __init__(
@@ -152,7 +179,9 @@ class Columns:
         counts: NDArray[np.bool_],
         numbers: dict[str, NDArray[np.float64]],
         lost: dict[str, NDArray[np.float64]],
+        series: tuple[Series, ...] = (),
     ) -> None:
+        self.series = series
         self.shot, self.attempt, self.counts, self.numbers, self._lost = shot, attempt, counts, numbers, lost
         self.counted = np.flatnonzero(counts)[np.argsort(shot[counts], kind="stable")]
 
@@ -177,28 +206,42 @@ class Columns:
         losses = {name: column[self.counted] for name, column in sorted(self._lost.items())}
         return {name: mean(column[~np.isnan(column)]) for name, column in losses.items()}
 
-    def trend(self, n_most: int, min_shots: int = 5) -> list[dict[str, Any]]:
-        """Filling and defect-free fraction of successive shots.
+    def shown(self, n_bins: int) -> list[dict[str, Any]]:
+        """The quantities that the page shows, each with its mean over all shots and its trend, for JSON."""
+        return [self._quantity(series, n_bins) for series in self.series]
+
+    def means(self) -> list[dict[str, Any]]:
+        """The same without trends."""
+        return [self._quantity(series, 0) for series in self.series]
+
+    def _quantity(self, series: Series, n_bins: int) -> dict[str, Any]:
+        bins = self._bins(n_bins)
+        total, *means = series.over([self.counted, *bins])
+        trend = [
+            {
+                "shot": float(self.shot[lines].mean()),
+                "n": series.n_known(lines),
+                **mean_values(value),
+            }
+            for lines, value in zip(bins, means, strict=True)
+        ]
+        return {**about_quantity(series.quantity, [total.value]), **mean_values(total), "trend": trend}
+
+    def _bins(self, n_most: int, min_shots: int = 5) -> list[NDArray[np.int64]]:
+        """The lines of successive shots.
 
         Args:
             n_most: Maximum number of bins.
             min_shots: Minimum number of shots in a bin; with fewer than twice as many shots, each is a bin.
         """
-        shot, filling, success = self.shot[self.counted], self.of_shots("filling"), self.of_shots("success")
-        n_bins = min(n_most, len(shot) // min_shots if len(shot) >= 2 * min_shots else len(shot))
-        edges = np.linspace(0, len(shot), n_bins + 1).round().astype(int) if n_bins else np.zeros(1, int)
-        bins = list[dict[str, Any]]()
-        for first, end in itertools.pairwise(edges):
-            judged = ~np.isnan(filling[first:end])
-            average, rate = mean(filling[first:end][judged]), rate_of(success[first:end][judged])
-            bins.append(
-                {
-                    "shot": float(shot[first:end].mean()),
-                    "n": int(judged.sum()),
-                    **judged_values(average, rate),
-                }
-            )
-        return bins
+        n = len(self.counted)
+        n_bins = min(n_most, n // min_shots if n >= 2 * min_shots else n)
+        return np.array_split(self.counted, n_bins) if n_bins else []
+
+
+def _row_of(text: bytes) -> IndexRow | None:
+    values = parse_object(text)
+    return None if values is None else row_of_line(values)
 
 
 def rate_of(success: NDArray[np.float64]) -> Rate:
@@ -214,16 +257,6 @@ def judged_values(filling: Estimate, rate: Rate) -> dict[str, Any]:
         "defect_free": finite(rate.value),
         "defect_free_interval": interval_of(rate),
     }
-
-
-def finite(value: float) -> float | None:
-    """A number for JSON: None instead of nan or infinity."""
-    return float(value) if math.isfinite(value) else None
-
-
-def interval_of(value: Estimate | Rate) -> list[float | None]:
-    """The 68 % interval for JSON."""
-    return [finite(end) for end in value.interval]
 
 
 def _seconds(t_utc: str) -> float:

@@ -79,7 +79,8 @@ class Channel:
                 self._changed.set()
                 self._changed = asyncio.Event()
             is_running = (state.get("run") or {}).get("status") == "running"
-            await asyncio.sleep(POLL_S if is_running or state.get("error") else 1.0)
+            is_changing = is_running or (state.get("scan") or {}).get("is_busy")
+            await asyncio.sleep(POLL_S if is_changing or state.get("error") else 1.0)
 
 
 class Live:
@@ -101,28 +102,29 @@ class Live:
         """Number of connections that are open."""
         return sum(channel.n_viewers for channel in self._channels.values())
 
-    def channel(self, day: str, name: str) -> Channel:
-        """The channel of a run; of the newest if both are empty."""
+    def channel(self, day: str, name: str, quantity: str) -> Channel:
+        """The channel of a run with a quantity at the points of its scan; of the newest if both are empty."""
         self._channels = {key: channel for key, channel in self._channels.items() if channel.n_viewers}
-        key = f"{day}/{name}"
+        key = f"{day}/{name}/{quantity}"
         if key not in self._channels:
-            self._channels[key] = Channel(lambda: self.state(day, name))
+            self._channels[key] = Channel(lambda: self.state(day, name, quantity))
         return self._channels[key]
 
-    def state(self, day: str = "", name: str = "") -> dict[str, Any]:
+    def state(self, day: str = "", name: str = "", quantity: str = "") -> dict[str, Any]:
         """The state of a run, of the newest by default; with "error" if it cannot be read."""
         try:
             run = self._catalogue.open(day, name) if name else self._catalogue.newest()
             if run is None:
                 return {"run": None, "running": [], "alarms": [], "error": ""}
-            return self._state_of(run).update() | {"running": self._catalogue.running(), "error": ""}
+            return self.state_of(run).update(quantity) | {"running": self._catalogue.running(), "error": ""}
         except Exception as error:  # noqa: BLE001 - whatever a damaged file leads to, the page must stay
             is_known = isinstance(error, LabseqError | OSError | NoSuchRun)
             text = text_of(error if is_known else format_error(error))
             alarms = [alarm("error", "This cannot be shown", text)]
             return {"run": None, "running": [], "alarms": alarms, "error": text}
 
-    def _state_of(self, run: OpenRun) -> RunState:
+    def state_of(self, run: OpenRun) -> RunState:
+        """What is known of a run; that of the last eight is kept."""
         state = self._states.get(run.id)
         if state is None or state.run is not run:
             state = self._states[run.id] = RunState(run, self._limits)

@@ -16,6 +16,8 @@ from typing import Any, Final, cast
 
 from labseq.data import Run, Shot
 from labseq.data.follower import Event, Follower
+from labseq.data.points import reporting_damage
+from labseq.data.quantities import WITH_TARGET, make_quantity, names_measured, quantity_problem
 from labseq.errors import RecordingError
 from labseq.files import read_file, write_file
 from labseq.messages import visible
@@ -24,6 +26,7 @@ from labseq.plain import dumps, now_utc, parse_object
 from labseq.recording.folders import INDEX_FILE, NOTES_FILE, RUN_FILE, STATE_FILE, runs_in
 from labseq.recording.run_file import read_run, read_state, target_of
 from labseq.web.history import RunHistory, judged_values
+from labseq.web.series import Series
 
 MAX_TEXT: Final = 2000
 """Maximum number of characters of a text from a file that is passed on."""
@@ -62,7 +65,7 @@ class OpenRun:
         self.folder = folder
         self.id = f"{folder.parent.name}/{folder.name}"
         self.follower = Follower(folder)
-        self.history = RunHistory(folder, self.follower)
+        self.history = RunHistory(folder, self.follower, self._series)
         self.lock = Lock()
         self._record: dict[str, Any] = {}
         self._record_stamp: object = None
@@ -93,6 +96,22 @@ class OpenRun:
             RecordingError: It is damaged.
         """
         return target_of(self.folder / RUN_FILE, self.record)
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Names of the quantities that the page of the run shows, the most important first.
+
+        Raises:
+            RecordingError: run.json is damaged.
+        """
+        with reporting_damage(self.folder):
+            measured = names_measured(self.record.get("resolved") or {}, self.target)
+            names = dict.fromkeys((*measured, *(() if self.target.is_none else WITH_TARGET)))
+            # a damaged or older record may name what this version does not know
+            return tuple(one for one in names if quantity_problem(one, (one,), (), self.target) is None)
+
+    def _series(self) -> list[Series]:
+        return [Series(make_quantity(name, self.target), self.folder) for name in self.shown]
 
     def read_events(self) -> None:
         """Read what was added to the event log.
@@ -134,24 +153,19 @@ class OpenRun:
         """
         return self.follower.shot(self.history.row(line))
 
+    def some(self, lines: Iterable[int]) -> Run:
+        """The run with the shots of some lines of the index alone, which is fast for any number of shots."""
+        return Run(self.folder, self.record, *read_state(self.folder), tuple(self.with_rows(lines)), ())
+
     def outline(self) -> Run:
-        """The run whose shots know only how they were judged, which is fast for any number of shots."""
-        status, error = read_state(self.folder)
-        if not len(self.history):
-            return Run(self.folder, self.record, status, error, (), ())
-        columns, some_row = self.history.columns(), self.history.row(0)
-        numbers = zip(
-            columns.shot[columns.counted].tolist(),
-            columns.of_shots("filling").tolist(),
-            columns.of_shots("success").tolist(),
-            strict=True,
+        """The run whose shots have nothing but their index, which is fast for any number of shots."""
+        counted = self.history.columns()
+        first = self.with_rows(counted.counted[:1].tolist())
+        shots = (
+            self.follower.shot(replace(first[0].row, shot=shot))
+            for shot in counted.shot[counted.counted if first else []].tolist()
         )
-        rows = (
-            replace(some_row, shot=shot, filling_fraction=filling, success=success == 1.0)
-            for shot, filling, success in numbers
-        )
-        shots = tuple(map(self.follower.shot, rows))
-        return Run(self.folder, self.record, status, error, shots, ())
+        return Run(self.folder, self.record, *read_state(self.folder), tuple(shots), ())
 
 
 class Catalogue:
@@ -302,7 +316,7 @@ def _matches(summary: Mapping[str, Any], words: Iterable[str]) -> bool:
 def _summary(run: OpenRun) -> dict[str, Any]:
     values: dict[str, Any] = {"id": text_of(run.id, 300), **read_notes(run.folder)}
     keys = ("name", "profile", "started_utc", "simulated", "n_shots", "n_done", "filling", "defect_free")
-    values |= dict.fromkeys((*keys, "has_scan"))
+    values |= dict.fromkeys((*keys, "has_scan")) | {"measured": []}
     try:
         record, (status, error) = run.record, read_state(run.folder)
         run.history.update()
@@ -321,6 +335,7 @@ def _summary(run: OpenRun) -> dict[str, Any]:
         "status": status,
         "error": text_of(error, 400),
         **judged_values(columns.filling, rate),
+        "measured": columns.means(),
         "outcome": outcome,
         "has_scan": bool(record.get("scan")),
     }

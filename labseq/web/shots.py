@@ -20,8 +20,8 @@ from labseq.errors import RecordingError
 from labseq.model import CycleRecord, ImageRecord, TargetPattern
 from labseq.plain import to_plain
 from labseq.recording.shot_file import iter_frames
-from labseq.web.history import finite
 from labseq.web.runs import text_of
+from labseq.web.series import finite
 
 _RANGE: Final = (0.01, 0.998)
 """Fractions of the pixels below black and white."""

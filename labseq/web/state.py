@@ -17,27 +17,24 @@ from labseq.analysis.timing import StageTotals
 from labseq.calibration_store import read_entry
 from labseq.console.events import event_text, point_of_shot
 from labseq.console.text import age_text, percent, plural, size_text
-from labseq.data import Shot, open_run
+from labseq.data import Shot
 from labseq.data.follower import Event
-from labseq.data.points import ScanPoint
-from labseq.data.scanned import Scanned, scanned
-from labseq.errors import LabseqError, RecordingError
+from labseq.errors import ConfigError, LabseqError, RecordingError
 from labseq.model import StageTiming
-from labseq.model.estimate import Rate, mean
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.plain import now
 from labseq.recording.folders import INDEX_FILE, STOP_FILE
-from labseq.recording.run_file import SCANNER, read_state
-from labseq.web.history import Columns, finite, judged_values
+from labseq.recording.run_file import read_state
+from labseq.web.history import Columns, judged_values
 from labseq.web.runs import OpenRun, profile_of, read_notes, text_of
+from labseq.web.scan import ScanView
+from labseq.web.series import finite
 from labseq.web.shots import rows_of, shot_values
 
 N_BINS: Final = 40
 """Maximum number of points of a trend."""
 _OPEN_S: Final = 0.5
 """Minimum time between opening shots, in seconds: reading a shot's file takes 10 to 20 ms of CPU."""
-_MAX_POINTS: Final = 2000
-"""Maximum number of points of a scan, and of visits of points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +67,13 @@ class RunState:
         self._opened_s = -math.inf
         self._shot_error = ""
         self._rows: list[dict[str, Any]] = []
-        self._scan: dict[str, Any] | None = None
-        self._scan_s = -math.inf
+        self._scans: OrderedDict[str, ScanView] = OrderedDict()
 
-    def update(self) -> dict[str, Any]:
+    def update(self, quantity: str = "") -> dict[str, Any]:
         """The state as the files are now, JSON-ready.
+
+        Args:
+            quantity: Name of the only quantity at the points of the scan; "" for those that the run measures.
 
         Raises:
             RecordingError: run.json is damaged, or a file cannot be read.
@@ -84,15 +83,15 @@ class RunState:
             self.run.history.update()
             self.run.read_events()
             columns = self.run.history.columns()
-            self._open_shots(record, status)
+            self._open_shots(record, status, columns)
             return {
                 "run": self._head(record, status, error),
                 "figures": figures_of(columns),
-                "trend": columns.trend(N_BINS),
+                "measured": columns.shown(N_BINS),
                 "losses": losses_of(columns),
                 "stages": self._rows,
                 "shot": self._last,
-                "scan": self._scan_now(record, status),
+                "scan": self._scan_now(quantity, status),
                 "alarms": self._alarms(record, status, error, columns),
                 "log": [log_line(event) for event in self.run.events[-12:]],
             }
@@ -108,23 +107,25 @@ class RunState:
             return None
         return taken_s / n_new * max(0, head["n_shots"] - head["n_done"])
 
-    def _open_shots(self, record: Mapping[str, Any], status: str) -> None:
+    def _open_shots(self, record: Mapping[str, Any], status: str, columns: Columns) -> None:
         """Read the newest shots, but not too often during a run: a later update reads the rest."""
-        lines = len(self.run.history)
+        lines = len(columns.shot)
         is_too_soon = status == "running" and time.monotonic() - self._opened_s < _OPEN_S
         if lines == self._n_opened or is_too_soon:
             return
         self._opened_s, self._shot_error = time.monotonic(), ""
         n_newest = 1 if self._n_opened else 20  # enough for the stages; older files are not read
-        for line in range(max(self._n_opened, lines - n_newest), lines):
+        # the last shot that counts is shown, even if attempts at the next one have failed since
+        good = int(columns.counts.nonzero()[0].max(initial=-1))
+        newest = {*range(max(self._n_opened, lines - n_newest), lines), max(good, self._n_opened)}
+        for line in sorted(newest & {*range(lines)}):
             try:
                 shot = self.run.shot(line)
                 self._stages[shot.index, shot.attempt] = shot.timing
-                if line == lines - 1:
+                if line == good or good < 0:
                     self._last = self._shot(shot, record)
             except RecordingError as error:
                 self._shot_error = text_of(error, 400)
-                self._last = {"error": self._shot_error}
         self._n_opened = lines
         while len(self._stages) > 50:  # stages are summed over these
             self._stages.popitem(last=False)
@@ -141,14 +142,46 @@ class RunState:
             totals.add_timing(timing)
         return stage_rows(totals, simulated=bool(record["simulated"]))
 
-    def _scan_now(self, record: Mapping[str, Any], status: str) -> dict[str, Any] | None:
-        """The scan, computed at most every half second during a run."""
-        if not record.get("scan"):
+    def scan(self, quantity: str, most_s: float) -> dict[str, Any] | None:
+        """The scan of the run with a quantity, or with those that the run measures; None without a scan.
+
+        Args:
+            quantity: Its name; "" for those that the run measures.
+            most_s: Maximum time to wait for fits and for files of shots, in seconds.
+
+        Raises:
+            ConfigError: The run has no such quantity.
+            RecordingError: A file cannot be read.
+        """
+        end_s = time.monotonic() + most_s
+        while True:
+            with self.run.lock:  # not for the whole time: pages need it
+                self.run.history.update()
+                self.run.read_events()
+                if not self.run.record.get("scan"):
+                    return None
+                view = self._scan(quantity)
+                values = view.values(read_s=0.2)
+                if not view.is_busy or time.monotonic() > end_s:
+                    return values
+            time.sleep(0.05)
+
+    def _scan(self, quantity: str) -> ScanView:
+        view = self._scans.pop(quantity, None) or ScanView(self.run, quantity)
+        self._scans[quantity] = view
+        while len(self._scans) > 8:
+            self._scans.popitem(last=False)
+        return view
+
+    def _scan_now(self, quantity: str, status: str) -> dict[str, Any] | None:
+        if not self.run.record.get("scan"):
             return None
-        if self._scan is None or time.monotonic() - self._scan_s > 0.5 or status != "running":
-            self._scan = scan_values(self.run)
-            self._scan_s = time.monotonic()
-        return self._scan
+        try:
+            view = self._scan(quantity)
+        except ConfigError as error:  # no such quantity
+            return {"error": text_of(error, 600)}
+        # a run needs its processor more
+        return {**view.values(read_s=0.03 if status == "running" else 0.3), "is_busy": view.is_busy}
 
     def _alarms(
         self, record: Mapping[str, Any], status: str, error: str, columns: Columns
@@ -341,79 +374,3 @@ def log_line(event: Event) -> dict[str, str]:
         else:
             text = event_text(name, values, None)
     return {"t_utc": text_of(event.t_utc, 40), "event": text_of(name, 60), "text": text_of(text or name, 400)}
-
-
-def scan_values(run: OpenRun) -> dict[str, Any]:
-    """The scan of a run, JSON-ready; "error" if it cannot be shown."""
-    scan = run.record["scan"]
-    try:
-        shown = scanned(open_run(run.folder) if SCANNER in scan else run.outline())
-    except (LabseqError, KeyError, IndexError, TypeError, ValueError) as error:
-        return {"error": text_of(f"the scan cannot be shown: {error}", 400)}
-    if shown is None:
-        addresses = [text_of(address, 200) for address in scan.get("addresses") or ()]
-        return {
-            "axes": [{"address": address, "words": [], "numbers": None} for address in addresses],
-            "points": [],
-        }
-    values = {
-        "axes": [_axis(shown, i) for i in range(len(shown.axes))],
-        "is_map": shown.is_map,
-        "n_planned": None if SCANNER in scan else len(scan.get("points") or ()),
-        "points": [
-            _point(point, place)
-            for point, place in list(zip(shown.points, shown.places, strict=True))[:_MAX_POINTS]
-        ],
-    }
-    return values | _adaptive(run) if SCANNER in scan else values
-
-
-def _axis(scan: Scanned, index: int) -> dict[str, Any]:
-    axis = scan.axes[index]
-    numbers = axis.numbers
-    return {
-        "address": text_of(axis.address, 200),
-        "words": [text_of(word, 60) for word in axis.labels],
-        "numbers": None if numbers is None else [finite(number) for number in numbers[0]],
-        "unit": "" if numbers is None else numbers[1],
-    }
-
-
-def _point(point: ScanPoint, place: tuple[int, ...]) -> dict[str, Any]:
-    judged = [shot for shot in point.shots if not math.isnan(shot.filling_fraction)]
-    filling = mean([shot.filling_fraction for shot in judged])
-    rate = Rate(sum(shot.success for shot in judged), len(judged))
-    return {
-        "place": list(place),
-        "written": [text_of(word, 60) for word in point.written.values()],
-        "n_shots": len(point.shots),
-        **judged_values(filling, rate),
-        **({} if rate.n_trials else {"defect_free_interval": [None, None]}),
-    }
-
-
-def _adaptive(run: OpenRun) -> dict[str, Any]:
-    """What the scanner optimises, its value at each visit of a point, and the best so far."""
-    scan = run.record["scan"]
-    visits = [
-        {"point": event.get("point"), "value": event.get("value"), "written": _texts(event.get("written"))}
-        for event in run.scan_events[-_MAX_POINTS:]
-    ]
-    last: Any = run.scan_events[-1].get("best") if run.scan_events else None
-    best = None
-    if isinstance(last, dict):
-        best = {
-            "point": last.get("point"),
-            "value": last.get("value"),
-            "written": _texts(last.get("written")),
-        }
-    return {
-        "figure": text_of(scan.get("figure") or "", 120),
-        "maximise": bool(scan.get("maximise", True)),
-        "visits": visits,
-        "best": best,
-    }
-
-
-def _texts(written: Any) -> dict[str, str]:
-    return {text_of(k, 200): text_of(v, 60) for k, v in written.items()} if isinstance(written, dict) else {}

@@ -14,8 +14,8 @@ from labseq.calibration_store import DECIDING, Damaged, Store, Stored, figure_of
 from labseq.errors import ConfigError, LabseqError, RecordingError
 from labseq.files import PROFILES, packaged_profiles_dir, profile_dir, read_file
 from labseq.queue.queue import Entry, Queue
-from labseq.web.history import finite
 from labseq.web.runs import Catalogue, run_id, text_of
+from labseq.web.series import finite
 
 
 def queue_values(root: Path) -> dict[str, Any]:

@@ -37,7 +37,7 @@ def answers(client: Any, path: str) -> Any:
 
 
 def test_columns_are_the_index_as_the_library_reads_it(run_dir: Path) -> None:
-    history, run = RunHistory(run_dir, Follower(run_dir)), open_run(run_dir)
+    history, run = RunHistory(run_dir, Follower(run_dir), list), open_run(run_dir)
     for _ in range(2):  # nothing is read twice
         history.update()
     columns = history.columns()

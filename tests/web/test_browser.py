@@ -237,6 +237,54 @@ def test_a_run_that_is_killed_is_said_to_have_died(server: Server, watched: Watc
     expect(page.locator(".progress-text")).to_have_text(re.compile("2 of 9 shots"))
 
 
+FULL_SPEED = """
+import itertools, sys
+from dataclasses import replace
+from pathlib import Path
+from tests.recording.records import make_shot
+from tests.web.clients import write_run
+writer = write_run(Path(sys.argv[1]), 1, n_shots=100_000)
+print("ready", flush=True)
+shot = make_shot()
+for index in itertools.count(1):
+    writer.write_shot(replace(shot, shot_index=index))
+"""
+
+
+def test_every_click_counts_while_shots_come_at_full_speed(tmp_path: Path, watched: Watched) -> None:
+    """Between the press and the release of a button the page gets new states."""
+    data = tmp_path / "data"
+    data.mkdir()
+    server = Server(data, ("--control",), {"LABSEQ_WEB_TOKEN": "t" * 20})
+    server.start()
+    run = subprocess.Popen(
+        [sys.executable, "-c", FULL_SPEED, str(data)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert run.stdout is not None
+        assert run.stdout.readline() == "ready\n"
+        page = watched.page
+        page.goto(server.address)
+        button = page.get_by_role("button", name="Stop after this shot")
+        for n_clicks in range(1, 21):
+            before = page.locator(".progress-text").inner_text()
+            button.hover()
+            page.mouse.down()
+            expect(page.locator(".progress-text")).not_to_have_text(before)
+            page.mouse.up()
+            page.wait_for_function("true")  # the dialog was answered
+            assert len(watched.faults) == n_clicks, watched.faults
+        assert {*watched.faults} == {"End this run after its current shot?"}
+        page.evaluate("window.confirm = () => true")
+        button.click()
+        expect(page.get_by_text("ends after this shot")).to_be_visible()
+        assert [*data.glob("*/*/STOP")]
+    finally:
+        run.kill()
+        run.communicate()
+        server.stop()
+
+
 def test_the_page_goes_on_after_the_server_was_restarted(server: Server, watched: Watched) -> None:
     page = watched.page
     writer = write_run(server.data, 1, n_shots=9)
@@ -324,6 +372,8 @@ def test_pages_of_a_folder_with_something_for_each(full: Server, watched: Watche
     assert watched.faults == []
     run = next(run.parent for run in full.data.glob("*/*scan-dop/run.json"))
     check_that_a_link_leads_to_the_same_shot_with_its_images_and_moves(full, page, run)
+    check_that_a_table_is_sorted_by_a_click(full, page, run)
+    check_that_any_quantity_can_be_chosen(full, page, run)
     check_that_a_comment_is_kept_and_found(full, page, run)
     page.goto(f"http://127.0.0.1:{full.port}/calibrations")
     page.wait_for_function(
@@ -377,6 +427,24 @@ def check_that_a_link_leads_to_the_same_shot_with_its_images_and_moves(
     expect(page.get_by_role("heading", name="Shot 2")).to_be_visible()
     page.go_back()
     expect(page.get_by_role("heading", name="Shot 1")).to_be_visible()
+
+
+def check_that_a_table_is_sorted_by_a_click(full: Server, page: Any, run: Path) -> None:
+    page.goto(f"http://127.0.0.1:{full.port}/runs/{run.parent.name}/{run.name}")
+    table = page.locator("section[aria-label='Shots'] table")
+    head = table.get_by_role("button", name="degree_of_parallelism")
+    for n_clicks, expected in ((1, ["2", "2", "5", "5", "8", "8"]), (2, ["8", "8", "5", "5", "2", "2"])):
+        head.click()
+        assert table.locator("tbody td:nth-child(3)").all_inner_texts() == expected, n_clicks
+    head.click()
+    assert table.locator("tbody td:nth-child(1)").all_inner_texts() == ["5", "4", "3", "2", "1", "0"]
+
+
+def check_that_any_quantity_can_be_chosen(full: Server, page: Any, run: Path) -> None:
+    page.goto(f"http://127.0.0.1:{full.port}/scan?run={run.parent.name}/{run.name}")
+    page.get_by_label("Quantity").select_option("n_atoms")
+    expect(page.get_by_role("heading", name="n_atoms by degree_of_parallelism")).to_be_visible()
+    expect(page.locator("section[aria-label='Points'] tbody tr")).to_have_count(3)
 
 
 def check_that_a_comment_is_kept_and_found(full: Server, page: Any, run: Path) -> None:

@@ -40,13 +40,15 @@ def test_figures_and_trend_leave_out_what_was_not_judged(tmp_path: Path) -> None
     for i, (filling, cycle) in enumerate(zip(fillings, seen, strict=True)):
         writer.write_shot(shot(i, filling, cycle))
     state = state_of(writer.run_dir)
-    figures, (first, second) = state["figures"], state["trend"]
+    filling, defect_free = state["measured"]
+    figures, (first, second) = state["figures"], filling["trend"]
     assert (figures["n_defect_free"], figures["n_judged"], figures["n_seen"]) == (4, 11, 4)
     assert (first["shot"], first["n"], second["shot"], second["n"]) == (2.5, 5, 8.5, 6)
-    assert first["filling"] == pytest.approx((1 + 0.5 + 1 + 0.75 + 1) / 5)
-    assert first["filling_interval"] == pytest.approx(mean([1, 0.5, 1, 0.75, 1]).interval)
-    assert (first["defect_free"], second["defect_free"]) == pytest.approx((3 / 5, 1 / 6))
-    assert first["defect_free_interval"] == pytest.approx(Rate(3, 5).interval)
+    assert first["value"] == pytest.approx((1 + 0.5 + 1 + 0.75 + 1) / 5)
+    assert first["interval"] == pytest.approx(mean([1, 0.5, 1, 0.75, 1]).interval)
+    first, second = defect_free["trend"]
+    assert (first["value"], second["value"]) == pytest.approx((3 / 5, 1 / 6))
+    assert first["interval"] == pytest.approx(Rate(3, 5).interval)
 
 
 def test_time_left_is_that_of_the_shots_since_the_run_was_resumed(tmp_path: Path) -> None:

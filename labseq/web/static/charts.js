@@ -18,8 +18,9 @@ export function redrawCharts() {  // after a change of the theme
   for (const box of open) box.remake();
 }
 
-// points: [{x, y, low, high}], options: {x, y, label, format, ink, height, line, lowest, xs}
+// points: [{x, y, low, high}], options: {x, y, label, format, ink, height, line, lowest, fit}; fit: [[x], [y]] of a curve
 export function curve(box, points, options) {
+  box.options = options;
   const data = [points.map((p) => p.x), points.map((p) => p.y), points.map((p) => p.low ?? p.y), points.map((p) => p.high ?? p.y)];
   if (box.chart) {
     box.points = points;
@@ -28,11 +29,11 @@ export function curve(box, points, options) {
     return;
   }
   box.points = points;
-  box.chartHeight = () => options.height?.() ?? 190;
+  box.chartHeight = () => box.options.height?.() ?? 190;
   box.remake = () => {
     const now = [0, 1, 2, 3].map((i) => box.points.map((p) => [p.x, p.y, p.low ?? p.y, p.high ?? p.y][i]));
     if (box.chart) box.chart.destroy();
-    box.chart = new uPlot(chartOptions(box, options), now, box.plot);
+    box.chart = new uPlot(chartOptions(box, box.options), now, box.plot);
   };
   box.readout = el("div.readout", { "aria-hidden": "true" });
   box.plot = el("div.plot");
@@ -62,18 +63,18 @@ function chartOptions(box, options) {
     padding: [10, 10, 0, 0], legend: { show: false },
     cursor: { y: false, points: { size: 8 }, drag: { setScale: true, x: true, y: false } },
     scales: { x: { time: Boolean(options.isTime), range: (_, low, high) => (low === high ? [low - 1, high + 1] : [low - 0.02 * (high - low), high + 0.02 * (high - low)]) },
-      y: { range: () => rangeOf(box.points, options) } },
-    axes: [{ ...axis, size: 2 * rem, space: 4.5 * rem, ...(options.whole ? { incrs: WHOLE } : {}), values: options.formatX ? (_, all) => all.map(options.formatX) : undefined },
-      { ...axis, size: 4.2 * rem, space: 2.4 * rem, values: (_, all) => all.map(options.format) }],
+      y: { range: () => rangeOf(box.points, box.options) } },
+    axes: [{ ...axis, size: 2 * rem, space: 4.5 * rem, ...(options.whole ? { incrs: WHOLE } : {}), values: options.formatX ? (_, all) => all.map((x) => box.options.formatX(x)) : undefined },
+      { ...axis, size: 4.2 * rem, space: (box.chartHeight() < 150 ? 1.3 : 2.4) * rem, values: (_, all) => all.map((y) => box.options.format(y)) }],
     series: [{}, { stroke: ink, width: options.line === false ? 0 : 1.6, spanGaps: true,
       points: { show: true, size: box.points.length > 60 ? 3 : 6, fill: ink, stroke: ink } }, { show: false }, { show: false }],
-    hooks: { draw: [(u) => drawBars(u, ink)], setCursor: [(u) => showValue(u, box, options)] },
+    hooks: { draw: [(u) => drawBars(u, ink), (u) => drawFit(u, box.options)], setCursor: [(u) => showValue(u, box, box.options)] },
   };
 }
 
 function rangeOf(points, options) {
   if (options.fixed) return options.fixed;
-  const ends = points.flatMap((p) => [p.y, p.low, p.high]).filter((v) => v !== null && v !== undefined && Number.isFinite(v));
+  const ends = [...points.flatMap((p) => [p.y, p.low, p.high]), ...(options.fit?.[1] ?? [])].filter((v) => v !== null && v !== undefined && Number.isFinite(v));
   if (!ends.length) return options.range ?? [0, 1];
   let low = Math.min(...ends), high = Math.max(...ends);
   const pad = 0.08 * (high - low || Math.abs(high) || 1);
@@ -99,6 +100,21 @@ function drawBars(u, ink) {
   ctx.restore();
 }
 
+function drawFit(u, { fit }) {
+  if (!fit) return;
+  const { ctx } = u, { left, top, width, height } = u.bbox;
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(left, top, width, height);
+  ctx.clip();
+  ctx.strokeStyle = colour("move");
+  ctx.lineWidth = 1.8 * devicePixelRatio;
+  ctx.beginPath();
+  fit[0].forEach((x, i) => fit[1][i] !== null && ctx.lineTo(u.valToPos(x, "x", true), u.valToPos(fit[1][i], "y", true)));
+  ctx.stroke();
+  ctx.restore();
+}
+
 function showValue(u, box, options) {
   const i = u.cursor.idx;
   const point = i === null || i === undefined ? null : box.points[i];
@@ -106,15 +122,7 @@ function showValue(u, box, options) {
     ? `${options.x} ${point.text ?? options.formatX?.(point.x) ?? point.x}: ${options.format(point.y)}${point.n ? ` (${point.n})` : ""}` : "";
 }
 
-export function trendPoints(trend, name) {
-  return trend.map((bin) => ({ x: bin.shot, y: bin[name], low: bin[`${name}_interval`][0], high: bin[`${name}_interval`][1],
-    n: bin.n > 1 ? `${bin.n} shots` : "" }));
-}
-
-const WHOLE = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000, 1_000_000];
-const nice = (fraction) => `${Number((100 * fraction).toFixed(2))} %`;
-export const FILLING = { x: "shot", label: "Filling", format: nice, ink: "blue", whole: true, highest: 1.0005, formatX: (x) => String(Math.round(x)) };
-export const DEFECT_FREE = { x: "shot", label: "Defect-free", format: nice, ink: "green", whole: true, lowest: -0.02, highest: 1.02, formatX: (x) => String(Math.round(x)) };
+export const WHOLE = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000, 1_000_000];
 
 // A bar for each row: {name, value, error, text}
 export function bars(rows, label) {

@@ -6,7 +6,7 @@ export function el(tag, props = {}, ...children) {
   if (classes.length) node.className = classes.join(" ");
   for (const [key, value] of Object.entries(props)) {
     if (value === null || value === undefined || value === false) continue;
-    if (key.startsWith("on")) node.addEventListener(key.slice(2), value);
+    if (key.startsWith("on")) { node[key] = value; (node.handlers ??= {})[key] = value; }
     else if (key === "class") node.className += ` ${value}`;
     else if (key in node && key !== "list" && !key.startsWith("aria")) node[key] = value;
     else node.setAttribute(key, value === true ? "" : value);
@@ -103,12 +103,46 @@ export function statusPill(status) {
   return el("span.pill", { class: `is-${status}` }, el("span", { "aria-hidden": "true" }, marks[status] ?? "·"), ` ${status}`);
 }
 
+const sorts = new Map();  // label of a table -> column and direction that its reader has chosen
+
+// rows: lists of cells, or {mark, cells}; or a function that returns them
 export function table(heads, rows, props = {}) {
-  const cells = (row, tag) => row.map((cell, i) => el(cell === "" ? "td" : tag, {
-    class: heads[i]?.right ? "num" : "", scope: tag === "th" ? "col" : null }, cell ?? "–"));
-  return el("div.scroller", { tabindex: "0", role: "region", "aria-label": `${props.label ?? "values"}, a table` },
-    el("table", {}, el("thead", {}, el("tr", {}, cells(heads.map((h) => h.text ?? h), "th"))),
-      el("tbody", {}, rows.map((row) => el("tr", { class: row.mark ?? "" }, cells(row.cells ?? row, "td"))))));
+  const label = props.label ?? "values";
+  const parts = () => {
+    const sort = sorts.get(label), listed = typeof rows === "function" ? rows() : rows;
+    return [el("thead", {}, el("tr", {}, heads.map((head, i) => headCell(head, sort?.column === i ? sort : null, (event) => {
+      sorts.set(label, sort?.column !== i ? { column: i, sign: 1 } : sort.sign > 0 ? { column: i, sign: -1 } : null);
+      patch(event.currentTarget.closest("table"), parts());
+    })))),
+    el("tbody", {}, sorted(listed, sort).map((row) => el("tr", { class: row.mark ?? "" }, (row.cells ?? row).map((cell, i) => el("td", { class: heads[i]?.right ? "num" : "" }, cell ?? "–")))))];
+  };
+  return el("div.scroller", { tabindex: "0", role: "region", "aria-label": `${label}, a table` }, el("table", {}, parts()));
+}
+
+function headCell(head, sort, onclick) {
+  const text = head.text ?? head, kind = head.right ? "num" : "";
+  if (text === "") return el("td", {});
+  return el("th", { class: kind, scope: "col", "aria-sort": sort ? (sort.sign > 0 ? "ascending" : "descending") : null }, el("button.sort", { type: "button", onclick }, text));
+}
+
+function sorted(rows, sort) {
+  if (!sort) return rows;
+  const keyed = rows.map((row) => [sortKey((row.cells ?? row)[sort.column]), row]);
+  return keyed.sort(([a], [b]) => {
+    if (a === null || b === null) return (a === null) - (b === null);  // what is unknown comes last
+    return sort.sign * (typeof a === "number" && typeof b === "number" ? a - b : String(a).localeCompare(String(b), undefined, { numeric: true }));
+  }).map(([, row]) => row);
+}
+
+const PREFIXES = { p: 1e-12, n: 1e-9, "µ": 1e-6, u: 1e-6, m: 1e-3, k: 1e3, M: 1e6, G: 1e9 };
+
+// A number with its unit as a number: "97.6(3) ms"; any other text as it is
+function sortKey(cell) {
+  const text = (cell instanceof Node ? cell.textContent : String(cell ?? "")).trim();
+  if (text === "" || text === "–") return null;
+  const [, number, unit = ""] = text.match(/^(-?[\d.]+(?:e[-+]?\d+)?)(?:\(\d+\))?(?: (\S{1,4}))?$/i) ?? [];
+  if (number === undefined) return text;
+  return Number(number) * (unit === "min" ? 60 : unit.length > 1 ? PREFIXES[unit[0]] ?? 1 : 1);
 }
 
 export function facts(values) {
@@ -125,4 +159,36 @@ export function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 }
 
-export function replace(node, ...children) { node.replaceChildren(...children.flat(9).filter(Boolean)); }
+const nodesOf = (children) => children.flat(9).filter((child) => child !== null && child !== undefined && child !== false)
+  .map((child) => (child instanceof Node ? child : document.createTextNode(child)));
+
+export function replace(node, ...children) { node.replaceChildren(...nodesOf(children)); }
+
+// Makes the children of a node equal to new ones, but keeps the elements that are there: a click, a focus or
+// an open list is not lost when the state changes between the press and the release of a button.
+export function patch(node, ...children) {
+  const next = nodesOf(children);
+  next.forEach((child, i) => {
+    const old = node.childNodes[i];
+    if (!old) node.append(child);
+    else if (old.nodeName !== child.nodeName) old.replaceWith(child);
+    else if (old !== child) patchNode(old, child);
+  });
+  while (node.childNodes.length > next.length) node.lastChild.remove();
+}
+
+function patchNode(old, next) {
+  if (old.nodeType === Node.TEXT_NODE) {
+    if (old.data !== next.data) old.data = next.data;
+    return;
+  }
+  for (const { name, value } of next.attributes) if (old.getAttribute(name) !== value) old.setAttribute(name, value);
+  for (const { name } of [...old.attributes]) if (!next.hasAttribute(name) && !(old.nodeName === "DETAILS" && name === "open")) old.removeAttribute(name);
+  for (const name of Object.keys({ ...old.handlers, ...next.handlers })) old[name] = next.handlers?.[name] ?? null;
+  old.handlers = next.handlers;
+  patch(old, [...next.childNodes]);
+  if (["INPUT", "SELECT"].includes(old.nodeName) && old !== document.activeElement) {
+    old.value = next.value;
+    if (old.checked !== next.checked) old.checked = next.checked;
+  }
+}

@@ -1,9 +1,10 @@
 // The run in progress, or one run while it is taken.
 import { setLink, server } from "./app.js";
 import { drawArray, drawFrame } from "./array.js";
-import { bars, curve, DEFECT_FREE, FILLING, progressBar, stageBar, trendPoints } from "./charts.js";
-import { clock, count, el, facts, localTime, panel, percent, percentWithError, post, replace, runLink, runPath, statusPill, table, time, withError } from "./dom.js";
+import { bars, closeCharts, progressBar, stageBar } from "./charts.js";
+import { clock, count, el, facts, localTime, panel, patch, percent, percentWithError, post, replace, runLink, runPath, statusPill, table, time, withError } from "./dom.js";
 import { follow, oneSlot } from "./live.js";
+import { axisName, drawTrend, measuredTiles, scanCurve, tile, titleOf } from "./measured.js";
 
 export async function showNow(main, _, asked) {
   const id = asked.get("run");
@@ -25,15 +26,15 @@ function canvasFigure(title) {
 function makeView(main) {
   const head = el("div.run-head"), alarms = el("div.alarms", { role: "status", "aria-live": "polite" }), tiles = el("div.tiles");
   const frame = canvasFigure("Last frame"), before = canvasFigure("Before the last cycle"), after = canvasFigure("After it");
-  const filling = el("div.chart"), rate = el("div.chart");
+  const trends = el("div.trends");
   const losses = el("div"), stages = el("div"), readings = el("div"), log = el("div"), choice = el("div.choice");
   const lossPanel = panel("Losses by cause", { class: "losses" }, losses);
   const grid = el("div.grid", {},
-    panel("Last shot", { class: "wide arrays", aside: choice }, el("div.figures", {}, frame.node, before.node, after.node)),
-    panel("Filling", { class: "trend" }, filling), panel("Defect-free", { class: "trend" }, rate),
+    panel("Last shot", { class: "arrays", aside: choice }, el("div.figures.last", {}, frame.node, before.node, after.node)),
+    el("div.side", {}, trends, lossPanel),
     panel("Stages against their budgets", { class: "stages" }, stages),
-    el("div.stack", {}, lossPanel, panel("Readings and interlocks", {}, readings), panel("Events", {}, log)));
-  let latest = null, picked = null, bitmap = null, reduced = 1, isBuilt = false;
+    el("div.stack", {}, panel("Readings and interlocks", {}, readings), panel("Events", {}, log)));
+  let charts = new Map(), latest = null, picked = null, bitmap = null, reduced = 1, isBuilt = false;
   const load = oneSlot((image, factor) => { bitmap = image; reduced = factor; arrays(); });
 
   function build() {
@@ -52,31 +53,42 @@ function makeView(main) {
     if (!isBuilt) build();
     const { run, figures } = state;
     document.title = `${run.status === "running" ? `${run.n_done}/${run.n_shots}` : run.status} ${run.name} · labseq`;
-    replace(head, headOf(run, state));
-    replace(alarms, alarmList(state.alarms));
-    replace(tiles, tilesOf(run, figures));
-    if (state.trend.length) {
-      curve(filling, trendPoints(state.trend, "filling"), { ...FILLING, height: chartHeight });
-      curve(rate, trendPoints(state.trend, "defect_free"), { ...DEFECT_FREE, height: chartHeight });
-    }
+    patch(head, headOf(run, state));
+    patch(alarms, alarmList(state.alarms));
+    patch(tiles, tilesOf(run, figures, state.measured, state.scan));
+    trendsOf(state);
     lossPanel.hidden = !state.losses.length;
-    replace(losses, bars(state.losses.map((one) => ({ name: one.cause, value: one.mean, text: withError(one.mean, one.error ?? 0) })), "Atoms lost in a shot"),
+    patch(losses, bars(state.losses.map((one) => ({ name: one.cause, value: one.mean, text: withError(one.mean, one.error ?? 0) })), "Atoms lost in a shot"),
       el("p.note", {}, "atoms in a shot, known in simulations"));
-    replace(stages, stageTable(state.stages, run.simulated));
-    replace(readings, readingsOf(state));
-    replace(log, el("ul.events", { tabindex: "0" }, [...state.log].reverse().map((line) => el("li", {}, el("time", { dateTime: line.t_utc }, localTime(line.t_utc, false)), " ", line.text))));
+    patch(stages, stageTable(state.stages, run.simulated));
+    patch(readings, readingsOf(state));
+    patch(log, el("ul.events", { tabindex: "0" }, [...state.log].reverse().map((line) => el("li", {}, el("time", { dateTime: line.t_utc }, localTime(line.t_utc, false)), " ", line.text))));
     shotOf(state);
+  }
+
+  // What is measured against the scanned value first, then by shot.
+  function trendsOf({ run, measured, scan }) {
+    const hasCurve = Boolean(scan?.points?.length && !scan.is_map && scan.quantities.length);
+    const names = [...(hasCurve ? [""] : []), ...measured.filter((one) => one.trend.length).map((one) => one.name)];
+    if (String([run.id, ...names]) !== trends.names) {
+      trends.names = String([run.id, ...names]);
+      closeCharts();
+      charts = new Map(names.map((name) => [name, name === "" ? scanCurve() : { node: el("div.chart") }]));
+      replace(trends, [...charts].map(([name, chart]) => panel(name === "" ? `${titleOf(scan.quantities[0])} by ${axisName(scan.axes[0])}` : titleOf(measured.find((one) => one.name === name)), { class: "trend" }, chart.node)));
+    }
+    if (hasCurve) charts.get("").draw(scan, 0, 0, chartHeight);
+    for (const one of measured) if (charts.has(one.name)) drawTrend(charts.get(one.name).node, one, { height: chartHeight });
   }
 
   function shotOf(state) {
     const shot = state.shot;
-    if (!shot || shot.error || !shot.images.length) { bitmap = null; arrays(); return; }
+    if (!shot || !shot.images.length) { bitmap = null; arrays(); return; }
     const withFrame = shot.images.map((one, i) => (one.has_frame ? i : -1)).filter((i) => i >= 0).pop();
     if (withFrame === undefined) bitmap = null;
-    else load(`/api/v1/runs/${runPath(state.run.id)}/shots/${shot.shot}/frames/${withFrame}.png?width=512${shot.status === "complete" ? "" : `&attempt=${shot.attempt}`}`);
+    else load(`/api/v1/runs/${runPath(state.run.id)}/shots/${shot.shot}/frames/${withFrame}.png?width=1024${shot.status === "complete" ? "" : `&attempt=${shot.attempt}`}`);
     const n = shot.cycles.length;
     if (picked !== null && picked >= n) picked = null;
-    replace(choice, el("a", { href: `/runs/${runPath(state.run.id)}/shots/${shot.shot}` }, `shot ${shot.shot}`), shot.point ? el("span.note", {}, shot.point) : null,
+    patch(choice, el("a", { href: `/runs/${runPath(state.run.id)}/shots/${shot.shot}` }, `shot ${shot.shot}`), shot.point ? el("span.note", {}, shot.point) : null,
       n > 1 ? el("label", {}, "cycle ", el("select", { "aria-label": "Cycle", onchange: (event) => { picked = event.target.value === "" ? null : Number(event.target.value); arrays(); } },
         el("option", { value: "", selected: picked === null }, "last"), shot.cycles.map((_, i) => el("option", { value: i, selected: picked === i }, String(i))))) : null);
     arrays();
@@ -85,8 +97,8 @@ function makeView(main) {
   function arrays() {
     const { run, shot } = latest ?? {};
     if (!run || !isBuilt) return;
-    const images = shot && !shot.error ? shot.images : [];
-    const cycle = shot && !shot.error ? shot.cycles[picked ?? shot.cycles.length - 1] : null;
+    const images = shot ? shot.images : [];
+    const cycle = shot ? shot.cycles[picked ?? shot.cycles.length - 1] : null;
     const at = cycle ? images.findIndex((one) => one.step === cycle.step && one.cycle === cycle.cycle) : images.length - 1;
     const last = images[images.length - 1], end = images[at < 0 ? images.length - 1 : at], start = cycle ? images[Math.max(0, at - 1)] : images[0];
     frame.node.hidden = !bitmap;  // before it is drawn: what is hidden has no width
@@ -95,7 +107,7 @@ function makeView(main) {
     if (!end) { before.node.hidden = after.node.hidden = true; return; }
     before.node.hidden = !cycle;
     after.node.hidden = false;
-    const caption = (image) => `${count(image.n_atoms, "atom")}, ${count(image.n_defects, "defect")}${image.n_surplus ? `, ${image.n_surplus} surplus` : ""}`;
+    const caption = (image) => `${count(image.n_atoms, "atom")}${run.target.n_atoms ? `, ${count(image.n_defects, "defect")}` : ""}${image.n_surplus ? `, ${image.n_surplus} surplus` : ""}`;
     if (cycle) {
       const moves = cycle.batches.slice(0, cycle.n_batches_played);
       drawArray(before.canvas, run.lattice, run.target.fill, start.occupancy, moves);
@@ -115,8 +127,7 @@ export function headOf(run, state) {
   const others = (state.running ?? []).filter((id) => id !== run.id);
   const left = run.time_left_s !== null && run.time_left_s !== undefined ? `${clock(run.time_left_s)} left` : "";
   return [
-    el("div.title-line", {}, el("h1", {}, run.name), statusPill(run.status), run.simulated ? el("span.tag", {}, "simulated") : null,
-      run.tags.map((tag) => el("span.tag", {}, tag)), run.is_stopping ? el("span.tag", {}, "ends after this shot") : null, stopButton(run)),
+    el("div.title-line", {}, el("h1", {}, run.name), statusPill(run.status), el("span", {}, run.simulated ? el("span.tag", {}, "simulated") : null, run.tags.map((tag) => el("span.tag", {}, tag))), stopButton(run)),
     el("div.sub-line", {}, runLink(run.id), el("span", {}, `profile ${run.profile}`), el("span", {}, `started ${localTime(run.started_utc)}`), el("span", {}, `seed ${run.seed}`),
       others.map((id) => el("a", { href: `/now?run=${encodeURIComponent(id)}` }, `also in progress: ${id}`))),
     el("div.progress-line", {}, progressBar(run.n_done, run.n_shots),
@@ -126,10 +137,10 @@ export function headOf(run, state) {
 }
 
 function stopButton(run) {
-  if (!server.may_act || run.status !== "running" || run.is_stopping) return null;
-  return el("button", { type: "button", onclick: async (event) => {
+  if (run.is_stopping) return el("span.tag", {}, "ends after this shot");
+  if (!server.may_act || run.status !== "running") return null;
+  return el("button", { type: "button", onclick: async () => {
     if (!confirm("End this run after its current shot?")) return;
-    event.target.disabled = true;
     try { await post(`/runs/${runPath(run.id)}/stop`, {}); } catch (error) { alert(error.message); }
   } }, "Stop after this shot");
 }
@@ -138,17 +149,16 @@ export function alarmList(alarms) {
   return alarms.map((one) => el("div.alarm", { class: `is-${one.level}` }, el("strong", {}, one.level === "error" ? "✕ " : "! ", one.title), one.text ? el("span", {}, one.text) : null));
 }
 
-function tile(name, value, note, kind = "") {
-  return el("div.tile", { class: kind }, el("div.tile-name", {}, name), el("div.tile-value", {}, value), el("div.tile-note", {}, note || "\u00a0"));
-}
-
-export function tilesOf(run, figures) {
-  const [low, high] = figures.defect_free_interval;
+export function tilesOf(run, figures, measured, scan) {
+  const [low, high] = figures.defect_free_interval, hasTarget = measured.some((one) => one.name === "defect_free");
   return [
-    tile("Defect-free", figures.n_judged ? percent(figures.defect_free) : "–", figures.n_judged ? `${figures.n_defect_free} of ${figures.n_judged}, ${(100 * low).toFixed(0)} to ${(100 * high).toFixed(0)} %` : "no judged shot yet", "is-green"),
-    tile("Filling", percentWithError(figures.filling, figures.filling_interval), `${count(run.target.n_atoms, "site")}, ${run.target.name}`, "is-blue"),
-    tile("Seen defect-free", run.n_done ? percent(figures.n_seen / run.n_done) : "–", `${figures.n_seen} of ${run.n_done}, in some image`),
-    tile("Cycles", figures.cycles === null ? "–" : figures.cycles.toFixed(1), "mean of a shot"),
+    ...measuredTiles(measured, scan),
+    ...(hasTarget ? [
+      tile("Defect-free", figures.n_judged ? percent(figures.defect_free) : "–", figures.n_judged ? `${figures.n_defect_free} of ${figures.n_judged}, ${(100 * low).toFixed(0)} to ${(100 * high).toFixed(0)} %` : "no judged shot yet", "is-green"),
+      tile("Filling", percentWithError(figures.filling, figures.filling_interval), `${count(run.target.n_atoms, "site")}, ${run.target.name}`, "is-blue"),
+      tile("Seen defect-free", run.n_done ? percent(figures.n_seen / run.n_done) : "–", `${figures.n_seen} of ${run.n_done}, in some image`),
+    ] : []),
+    hasTarget || figures.cycles ? tile("Cycles", figures.cycles === null ? "–" : figures.cycles.toFixed(1), "mean of a shot") : null,
     tile("Shot", time(figures.shot_s), "mean, all steps"),
     tile("Failed attempts", String(run.n_attempts), run.n_attempts ? "see alarms" : "none", run.n_attempts ? "is-warn" : ""),
   ];

@@ -1,7 +1,8 @@
 // The list of runs, one run, and two runs side by side.
 import { go, server } from "./app.js";
-import { bars, curve, DEFECT_FREE, FILLING, trendPoints } from "./charts.js";
-import { count, el, facts, failure, getJson, localTime, panel, percent, percentWithError, post, replace, runLink, runPath, statusPill, table, time, withError } from "./dom.js";
+import { bars } from "./charts.js";
+import { count, el, facts, failure, getJson, localTime, panel, patch, percent, percentWithError, post, replace, runLink, runPath, statusPill, table, time, withError } from "./dom.js";
+import { drawTrend, isOfTarget, meanText, titleOf, valueText } from "./measured.js";
 import { headOf, stageTable, tilesOf } from "./page_now.js";
 import { scanOfRun } from "./page_scan.js";
 
@@ -21,15 +22,16 @@ export async function showRuns(main, _, asked) {
       const answer = await getJson(`/runs?${query}`);
       history.replaceState(null, "", `/runs?${new URLSearchParams([...query].filter(([key, value]) => value && key !== "n" && value !== "0"))}`.replace(/\?$/, ""));
       note.textContent = `${answer.n_found} of ${count(answer.n_runs, "run")}`;
-      replace(found, answer.runs.length ? listOf(answer.runs) : el("p.hint", {}, answer.n_runs ? "No run has these words." : "There are no runs in this data folder yet."), pages(answer.n_found));
-    } catch (error) { replace(found, failure(error)); }
+      patch(found, answer.runs.length ? listOf(answer.runs) : el("p.hint", {}, answer.n_runs ? "No run has these words." : "There are no runs in this data folder yet."), pages(answer.n_found));
+    } catch (error) { patch(found, failure(error)); }
   }
   function listOf(runs) {
-    const heads = ["", "run", "started", "profile", { text: "shots", right: true }, "status", { text: "defect-free", right: true }, { text: "filling", right: true }, "comment"];
-    return table(heads, runs.map((run) => [
+    const heads = ["", "run", "started", "profile", { text: "shots", right: true }, "status", "measured", { text: "defect-free", right: true }, { text: "filling", right: true }, "comment"];
+    return table(heads, () => runs.map((run) => [
       el("input", { type: "checkbox", checked: chosen.has(run.id), "aria-label": `Choose ${run.id} to compare`, onchange: (event) => { event.target.checked ? chosen.add(run.id) : chosen.delete(run.id); compare.disabled = chosen.size !== 2; } }),
       runLink(run.id), localTime(run.started_utc), run.profile, run.n_shots === null ? "–" : `${run.n_done} of ${run.n_shots}`,
       [statusPill(run.status), run.simulated ? el("span.tag", {}, "simulated") : null, run.has_scan ? el("span.tag", {}, "scan") : null].filter(Boolean),
+      run.measured.filter((one) => !isOfTarget(one)).map((one) => `${one.title} ${meanText(one, one)}`).join(", ") || "–",
       percent(run.defect_free), percentWithError(run.filling, run.filling_interval),
       [run.tags.map((tag) => el("span.tag", {}, tag)), " ", (run.comment || (run.status === "damaged" ? run.error : "")).slice(0, 120)],
     ].map((cell) => (Array.isArray(cell) ? el("span", {}, cell) : cell))), { label: "Runs" });
@@ -52,34 +54,31 @@ export async function showRun(main, [day, name]) {
   const id = `${day}/${name}`, values = await getJson(`/runs/${runPath(id)}`);
   const { run } = values;
   document.title = `${run.name} · labseq`;
-  const filling = el("div.chart"), rate = el("div.chart"), more = el("div.grid"), shots = el("div"), scan = el("div.grid");
+  const tiles = el("div.tiles"), trends = values.measured.filter((one) => one.trend.length).map((one) => [one, el("div.chart")]), more = el("div.grid"), shots = el("div"), scan = el("div.grid");
   replace(main, el("div.run-head", {}, headOf(run, {}), el("div.links", {}, run.status === "running" ? el("a", { href: `/now?run=${encodeURIComponent(id)}` }, "watch it") : null,
     values.has_scan ? el("a", { href: `/scan?run=${encodeURIComponent(id)}` }, "its scan") : null, values.files.map((kind) => el("a", { href: `/api/v1/runs/${runPath(id)}/files/${kind}` }, kind)), el("a", { href: `/api/v1/runs/${runPath(id)}` }, "as JSON"))),
     run.error ? el("div.alarm.is-error", {}, el("strong", {}, run.status), el("span", {}, run.error)) : null,
     values.n_damaged_lines ? el("div.alarm.is-warning", {}, el("strong", {}, `${count(values.n_damaged_lines, "line")} of the index cannot be read`)) : null,
-    el("div.tiles", {}, tilesOf(run, values.figures)),
-    el("div.grid", {}, panel("Filling", { class: "half" }, filling), panel("Defect-free", { class: "half" }, rate)), scan, more,
+    tiles, scan, el("div.grid", {}, trends.map(([one, box]) => panel(titleOf(one), { class: "half" }, box))), more,
     el("div.grid", {}, panel("Shots", { class: "wide" }, shots), panel("Changed by the command line", { class: "half" }, orNone(values.changes)), notesPanel(run),
       panel("Calibrations", { class: "half" }, orNone(values.calibrations)), panel("Devices", { class: "half" }, Object.entries(values.devices).map(([device, about]) => el("details", {}, el("summary", {}, device, about.model ? `: ${about.model}` : ""), typeof about === "object" ? facts(about) : about))),
       panel("Where it came from", { class: "wide" }, el("details", {}, el("summary", {}, `labseq ${values.provenance.labseq ?? "?"} on ${values.provenance.host ?? "?"}`), facts({ ...values.provenance, plugins: values.plugins.map((one) => `${one.name} ${one.version}`).join(", ") })))));
-  if (values.trend.length) {
-    curve(filling, trendPoints(values.trend, "filling"), FILLING);
-    curve(rate, trendPoints(values.trend, "defect_free"), DEFECT_FREE);
-  }
-  fillLater(id, values, more, scan);
+  patch(tiles, tilesOf(run, values.figures, values.measured, null));
+  for (const [one, box] of trends) drawTrend(box, one);
+  fillLater(id, values, more, scan, tiles);
   await shotTable(shots, id);
 }
 
-async function fillLater(id, values, more, scan) {
+async function fillLater(id, values, more, scan, tiles) {
   try {
-    if (values.has_scan) await scanOfRun(scan, id);
+    if (values.has_scan) patch(tiles, tilesOf(values.run, values.figures, values.measured, await scanOfRun(scan, id)));
     const { statistics, stages, n_read, n_shots } = await getJson(`/runs/${runPath(id)}/statistics`);
     const part = n_read < n_shots ? `from ${n_read} of ${n_shots} shots` : `from all ${count(n_shots, "shot")}`;
     const each = (one, factor = 1) => withError(one.mean === null ? null : factor * one.mean, factor * (one.error ?? 0));
     replace(more,
       statistics.cycles.length ? panel(`Cycles, ${part}`, { class: "half" }, table(["cycle", ...["shots", "defect-free", "seen", "filling", "moves", "batches", "left out"].map((text) => ({ text, right: true }))],
         statistics.cycles.map((one) => [String(one.cycle), String(one.n_shots), percent(one.defect_free.rate), percent(one.seen.rate), one.filling.mean === null ? "–" : `${each(one.filling, 100)} %`, each(one.n_atom_moves), each(one.n_batches), each(one.n_left_out)]), { label: "Cycles" })) : null,
-      panel(`Defects at the end, ${part}`, { class: "half" }, statistics.defects.length ? bars(statistics.defects.slice(0, 13).map((n, defects) => ({ name: String(defects), value: n, text: count(n, "shot") })), "Shots by number of defects") : el("p.hint", {}, "no judged shot")),
+      statistics.defects.length ? panel(`Defects at the end, ${part}`, { class: "half" }, bars(statistics.defects.slice(0, 13).map((n, defects) => ({ name: String(defects), value: n, text: count(n, "shot") })), "Shots by number of defects")) : null,
       values.losses.length ? panel("Losses by cause", { class: "half" }, bars(values.losses.map((one) => ({ name: one.cause, value: one.mean, text: withError(one.mean, one.error ?? 0) })), "Atoms lost in a shot")) : null,
       panel("Stages", { class: "half" }, stageTable(stages, values.run.simulated)));
   } catch (error) { replace(more, failure(error)); }
@@ -88,15 +87,23 @@ async function fillLater(id, values, more, scan) {
 function orNone(values) { return Object.keys(values).length ? facts(values) : el("p.hint", {}, "none"); }
 
 async function shotTable(box, id, first = 0) {
-  const { shots, n_lines } = await getJson(`/runs/${runPath(id)}/shots?first=${first}&n=${PAGE}`);
+  const { shots, n_lines, scanned, measured } = await getJson(`/runs/${runPath(id)}/shots?first=${first}&n=${PAGE}`);
   if (!n_lines) { replace(box, el("p.hint", {}, "no shot yet")); return; }
-  const heads = [{ text: "shot", right: true }, "outcome", ...["filling", "seen after cycle", "cycles", "batches", "moves", "time"].map((text) => ({ text, right: true }))];
-  const rows = shots.map((one) => [el("a", { href: `/runs/${runPath(id)}/shots/${one.shot}${one.counts ? "" : `?attempt=${one.attempt}`}` }, String(one.shot)),
-    !one.counts ? `attempt ${one.attempt}, does not count` : one.success === 1 ? "defect-free" : one.filling === null ? "not judged" : "defects", percent(one.filling, 2), one.seen >= 0 ? String(one.seen) : "–", one.n_cycles, one.n_batches, one.n_atom_moves, time(one.duration_s)].map((cell) => (typeof cell === "number" ? String(cell) : cell)));
+  const own = measured.map((one, i) => [one, i]).filter(([one]) => !isOfTarget(one)), hasTarget = own.length < measured.length;
+  const numbers = [...scanned, ...own.map(([one]) => one.title), ...(hasTarget ? ["defects", "filling", "seen after cycle", "cycles", "batches", "moves"] : []), "time"];
+  const heads = [{ text: "shot", right: true }, "outcome", ...numbers.map((text) => ({ text, right: true }))];
+  const rows = shots.map((one) => [el("a", { href: `/runs/${runPath(id)}/shots/${one.shot}${one.counts ? "" : `?attempt=${one.attempt}`}` }, String(one.shot)), outcomeOf(one),
+    ...one.scanned, ...own.map(([quantity, i]) => valueText(quantity, one.measured[i])),
+    ...(hasTarget ? [one.n_defects ?? "–", percent(one.filling, 2), one.seen >= 0 ? one.seen : "–", one.n_cycles, one.n_batches, one.n_atom_moves].map(String) : []), time(one.duration_s)]);
   replace(box, table(heads, rows, { label: "Shots" }), n_lines > PAGE ? el("div.pages", {},
     el("button", { type: "button", disabled: first === 0, onclick: () => shotTable(box, id, Math.max(0, first - PAGE)) }, "Later"),
     el("span.note", {}, `${first + 1} to ${Math.min(n_lines, first + PAGE)} of ${n_lines}, the newest first`),
     el("button", { type: "button", disabled: first + PAGE >= n_lines, onclick: () => shotTable(box, id, first + PAGE) }, "Earlier")) : null);
+}
+
+function outcomeOf(shot) {
+  if (!shot.counts) return `attempt ${shot.attempt}, does not count`;
+  return shot.success === 1 ? "defect-free" : shot.filling === null ? "not judged" : "defects";
 }
 
 function notesPanel(run) {
@@ -113,20 +120,31 @@ export async function showCompare(main, _, asked) {
   const ids = [asked.get("a") ?? "", asked.get("b") ?? ""];
   const runs = await Promise.all(ids.map((id) => getJson(`/runs/${runPath(id)}`)));
   const texts = await Promise.all(ids.map(async (id) => { const answer = await fetch(`/api/v1/runs/${runPath(id)}/files/sequence`); return answer.ok ? answer.text() : ""; }));
-  const rows = [["profile", (r) => r.run.profile], ["status", (r) => r.run.status], ["shots", (r) => `${r.run.n_done} of ${r.run.n_shots}`], ["defect-free", (r) => `${percent(r.figures.defect_free)} (${r.figures.n_defect_free} of ${r.figures.n_judged})`],
-    ["filling", (r) => percentWithError(r.figures.filling, r.figures.filling_interval)], ["cycles", (r) => r.figures.cycles?.toFixed(2) ?? "–"], ["time of a shot", (r) => time(r.figures.shot_s)], ["seed", (r) => r.run.seed],
+  const scans = await Promise.all(runs.map((r) => (r.has_scan ? getJson(`/runs/${runPath(r.run.id)}/scan`) : null)));
+  const names = [...new Set(runs.flatMap((r) => r.measured.map((one) => one.name)))];
+  const ofRun = (r, name) => r.measured.find((one) => one.name === name);
+  const rows = [["profile", (r) => r.run.profile], ["status", (r) => r.run.status], ["shots", (r) => `${r.run.n_done} of ${r.run.n_shots}`],
+    ...names.map((name) => [name, (r) => (ofRun(r, name) ? meanText(ofRun(r, name), ofRun(r, name)) : "–")]), ["fit", (_, i) => fitsOf(scans[i])],
+    ["cycles", (r) => r.figures.cycles?.toFixed(2) ?? "–"], ["time of a shot", (r) => time(r.figures.shot_s)], ["seed", (r) => r.run.seed],
     ["changed", (r) => Object.entries(r.changes).map(([k, v]) => `${k} = ${v}`).join(", ") || "nothing"], ["calibrations", (r) => Object.entries(r.calibrations).map(([k, v]) => `${k} ${v}`).join(", ") || "none"], ["comment", (r) => r.run.comment || "–"]];
-  const charts = runs.map(() => [el("div.chart"), el("div.chart")]);
-  replace(main, el("h1", {}, "Two runs"), table(["", ...runs.map((r) => el("span", {}, runLink(r.run.id)))], rows.map(([name, of]) => ({ mark: of(runs[0]) === of(runs[1]) ? "" : "is-other", cells: [name, of(runs[0]), of(runs[1])] })), { label: "Figures of both runs" }),
-    el("div.grid", {}, runs.map((r, i) => panel(`Filling: ${r.run.id}`, { class: "half" }, charts[i][0])), runs.map((r, i) => panel(`Defect-free: ${r.run.id}`, { class: "half" }, charts[i][1])),
+  const charts = names.flatMap((name) => runs.filter((r) => ofRun(r, name)?.trend.length).map((r) => [ofRun(r, name), r, el("div.chart")]));
+  replace(main, el("h1", {}, "Two runs"), table(["", ...runs.map((r) => r.run.id)], rows.map(([name, of]) => ({ mark: of(runs[0], 0) === of(runs[1], 1) ? "" : "is-other", cells: [name, of(runs[0], 0), of(runs[1], 1)] })), { label: "Figures of both runs" }),
+    el("div.sub-line", {}, runs.map((r) => runLink(r.run.id))),
+    el("div.grid", {}, charts.map(([one, r, box]) => panel(`${titleOf(one)}: ${r.run.id}`, { class: "half" }, box)),
       panel("Lines of the sequences that differ", { class: "wide" }, differences(texts))));
-  const ends = runs.flatMap((r) => r.trend.flatMap((bin) => [bin.filling, ...bin.filling_interval])).filter((v) => v !== null);
-  const range = ends.length ? [Math.min(...ends) - 0.001, Math.max(...ends) + 0.001] : [0, 1];
-  runs.forEach((r, i) => {
-    if (!r.trend.length) return;
-    curve(charts[i][0], trendPoints(r.trend, "filling"), { ...FILLING, fixed: range });
-    curve(charts[i][1], trendPoints(r.trend, "defect_free"), { ...DEFECT_FREE, fixed: [-0.02, 1.02] });
-  });
+  for (const [one, , box] of charts) drawTrend(box, one, { fixed: rangeOf(runs.map((r) => ofRun(r, one.name)).filter(Boolean)) });
+}
+
+function fitsOf(scan) {
+  return (scan?.quantities ?? []).filter((one) => one.fit?.report).map((one) => `${one.fit.report.name} ${one.fit.report.text}`).join(", ") || "–";
+}
+
+// The same range for both runs
+function rangeOf(quantities) {
+  const ends = quantities.flatMap((one) => one.trend.flatMap((bin) => [bin.value, ...bin.interval])).filter((value) => value !== null);
+  if (!ends.length) return [0, 1];
+  const low = Math.min(...ends), high = Math.max(...ends), pad = 0.05 * (high - low || Math.abs(high) || 1);
+  return [low - pad, high + pad];
 }
 
 function differences([a, b]) {

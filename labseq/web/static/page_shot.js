@@ -53,11 +53,11 @@ function cyclesPanel(run, shot, draws) {
 function framesPanel(run, shot, base, suffix, draws) {
   const figures = shot.images.map((image, i) => {
     const canvas = el("canvas", { role: "img", "aria-label": `${image.name}: ${count(image.n_atoms, "atom")}` });
-    const caption = el("figcaption", {}, `${i}: ${image.name}${image.cycle >= 0 ? `, cycle ${image.cycle}` : ""}: ${count(image.n_atoms, "atom")}, ${count(image.n_defects, "defect")}${image.n_surplus ? `, ${image.n_surplus} surplus` : ""}; at ${time(image.t_start_s)}, ${time(image.exposure_s)}`);
+    const caption = el("figcaption", {}, `${i}: ${image.name}${image.cycle >= 0 ? `, cycle ${image.cycle}` : ""}: ${count(image.n_atoms, "atom")}${run.target.n_atoms ? `, ${count(image.n_defects, "defect")}` : ""}${image.n_surplus ? `, ${image.n_surplus} surplus` : ""}; at ${time(image.t_start_s)}, ${time(image.exposure_s)}`);
     let bitmap = null, reduced = 1;
     draws.push(() => (image.has_frame ? bitmap && drawFrame(canvas, bitmap, reduced, shot.sites_px, image.occupancy) : drawArray(canvas, run.lattice, run.target.fill, image.occupancy)));
     if (image.has_frame)
-      fetch(`/api/v1${base}/frames/${i}.png?width=512${suffix ? `&${suffix}` : ""}`).then(async (answer) => {
+      fetch(`/api/v1${base}/frames/${i}.png?width=1024${suffix ? `&${suffix}` : ""}`).then(async (answer) => {
         if (!answer.ok) { caption.textContent += "; its frame cannot be read"; return; }
         reduced = Number(answer.headers.get("x-reduced") ?? 1);
         bitmap = await createImageBitmap(await answer.blob());
@@ -65,7 +65,7 @@ function framesPanel(run, shot, base, suffix, draws) {
       }).catch(() => { caption.textContent += "; its frame cannot be loaded"; });
     return el("figure", {}, canvas, caption);
   });
-  return panel("Images", { class: "wide" }, el("div.figures.many", {}, figures));
+  return panel("Images", { class: "wide" }, el("div.figures.frames", {}, figures));
 }
 
 function stages(shot) {

@@ -1,0 +1,185 @@
+"""The scan of a run as its points fill: its axes, quantities at each point, and their fits."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Mapping
+from typing import Any, Final
+
+from labseq.data import Shot, open_run
+from labseq.data.points import ScanPoint
+from labseq.data.quantities import column_names, find_quantity, image_names, make_quantity
+from labseq.data.scanned import Scanned, scanned
+from labseq.errors import LabseqError
+from labseq.model.estimate import Estimated
+from labseq.recording.run_file import SCANNER
+from labseq.web.fitting import LiveFit, points_to_fit
+from labseq.web.runs import OpenRun, text_of
+from labseq.web.series import Series, about_quantity, finite, mean_values
+
+_MAX_POINTS: Final = 2000
+"""Maximum number of points of a scan, and of visits of points."""
+_SHARE: Final = 0.2
+"""Greatest share of the time that is spent on computing the values of a scan."""
+
+
+class ScanView:
+    """The scan of a run, for a page that shows some quantities. Its methods are called under the run's lock.
+
+    Args:
+        run: The run.
+        quantity: Name of the only quantity to show; "" for those of the run's page.
+
+    Raises:
+        ConfigError: The run has no such quantity.
+        RecordingError: A file cannot be read.
+    """
+
+    def __init__(self, run: OpenRun, quantity: str = "") -> None:
+        self._run = run
+        self._own: Series | None = None
+        if quantity and quantity not in run.shown:
+            self._own = Series(find_quantity(_first_shots(run), quantity), run.folder)
+        self._names = (quantity,) if quantity else run.shown
+        resolved: Mapping[str, Any] = run.record.get("resolved") or {}
+        self._fits = {
+            one["value"]: LiveFit(make_quantity(one["value"], run.target), one, run.some(()))
+            for one in resolved.get("measure") or ()
+            if one.get("fit") and one["value"] in self._names
+        }
+        self._choices: list[str] = []
+        self._values: dict[str, Any] = {}
+        self._next_s = -math.inf
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether it changes without new shots: a fit is being computed, or files are still to be read."""
+        is_reading = self._own is not None and self._own.n_unread > 0
+        return is_reading or not all(fit.is_ready for fit in self._fits.values())
+
+    def values(self, read_s: float) -> dict[str, Any]:
+        """The scan, JSON-ready; "error" if it cannot be shown.
+
+        Args:
+            read_s: Time that may be spent on reading the files of shots, in seconds.
+        """
+        start_s = time.monotonic()
+        if start_s < self._next_s:
+            return self._values
+        try:
+            self._values = self._compute(read_s)
+        except (LabseqError, AttributeError, LookupError, TypeError, ValueError) as error:
+            self._values = {"error": text_of(f"the scan cannot be shown: {error}", 400)}
+        end_s = time.monotonic()
+        self._next_s = end_s + (end_s - start_s) * (1 / _SHARE - 1)
+        return self._values
+
+    def _compute(self, read_s: float) -> dict[str, Any]:
+        run, scan = self._run, self._run.record["scan"]
+        shown = scanned(open_run(run.folder) if SCANNER in scan else run.outline())
+        if self._own is not None:
+            for row in run.history.rows(len(self._own)):
+                self._own.add(row)
+            self._own.read(run.shot, read_s)
+        if not self._choices and len(run.history):
+            self._choices = _choices(run)
+        head = {
+            "quantity": self._names[0],
+            "choices": self._choices,
+            "n_unread": 0 if self._own is None else self._own.n_unread,
+        }
+        if shown is None:
+            axes = [{"address": text_of(one, 200), "words": [], "numbers": None} for one in scan["addresses"]]
+            return {**head, "axes": axes, "quantities": [], "points": []}
+        series = self._series()
+        means = [one.over([self._lines(point.shots) for point in shown.points]) for one in series]
+        values = {
+            **head,
+            "axes": [_axis(shown, i) for i in range(len(shown.axes))],
+            "is_map": shown.is_map,
+            "n_planned": None if SCANNER in scan else len(scan.get("points") or ()),
+            "quantities": [self._quantity(*one, shown) for one in zip(series, means, strict=True)],
+            "points": [
+                _point(point, shown.places[i], [one[i] for one in means])
+                for i, point in enumerate(shown.points[:_MAX_POINTS])
+            ],
+        }
+        return values | _adaptive(run) if SCANNER in scan else values
+
+    def _series(self) -> list[Series]:
+        known = [one for one in self._run.history.columns().series if one.quantity.name in self._names]
+        return [*known, *([] if self._own is None else [self._own])]
+
+    def _lines(self, shots: tuple[Shot, ...]) -> list[int]:
+        lines = (self._run.history.line_of(shot.index) for shot in shots)
+        return [line for line in lines if line is not None]
+
+    def _quantity(self, series: Series, means: list[Estimated], shown: Scanned) -> dict[str, Any]:
+        about = about_quantity(series.quantity, [mean.value for mean in means])
+        fit = self._fits.get(series.quantity.name)
+        if fit is None:
+            return {**about, "fit": None}
+        points = points_to_fit(shown.on_axis(0) if len(shown.axes) == 1 else None, means)
+        return {**about, "fit": fit.result(points)}
+
+
+def _first_shots(run: OpenRun) -> Any:
+    """The run with its first shots, in which names of images and columns are looked up."""
+    return run.some(run.history.columns().counted[:3].tolist())
+
+
+def _choices(run: OpenRun) -> list[str]:
+    """The quantities that the page offers: shown ones, survival between images, columns, results."""
+    first = _first_shots(run)
+    pairs = itertools.combinations(image_names(first), 2)
+    survival = (f"survival:{before},{after}" for before, after in pairs)
+    return [*dict.fromkeys((*run.shown, *survival, *column_names(first)))]
+
+
+def _axis(scan: Scanned, index: int) -> dict[str, Any]:
+    axis = scan.axes[index]
+    numbers = axis.numbers
+    return {
+        "address": text_of(axis.address, 200),
+        "words": [text_of(word, 60) for word in axis.labels],
+        "numbers": None if numbers is None else [finite(number) for number in numbers[0]],
+        "unit": "" if numbers is None else numbers[1],
+    }
+
+
+def _point(point: ScanPoint, place: tuple[int, ...], means: list[Estimated]) -> dict[str, Any]:
+    return {
+        "place": list(place),
+        "written": [text_of(word, 60) for word in point.written.values()],
+        "n_shots": len(point.shots),
+        "values": [mean_values(mean) for mean in means],
+    }
+
+
+def _adaptive(run: OpenRun) -> dict[str, Any]:
+    """What the scanner optimises, its value at each visit of a point, and the best so far."""
+    scan = run.record["scan"]
+    visits = [
+        {"point": event.get("point"), "value": event.get("value"), "written": _texts(event.get("written"))}
+        for event in run.scan_events[-_MAX_POINTS:]
+    ]
+    last: Any = run.scan_events[-1].get("best") if run.scan_events else None
+    best = None
+    if isinstance(last, dict):
+        best = {
+            "point": last.get("point"),
+            "value": last.get("value"),
+            "written": _texts(last.get("written")),
+        }
+    return {
+        "figure": text_of(scan.get("figure") or "", 120),
+        "maximise": bool(scan.get("maximise", True)),
+        "visits": visits,
+        "best": best,
+    }
+
+
+def _texts(written: Any) -> dict[str, str]:
+    return {text_of(k, 200): text_of(v, 60) for k, v in written.items()} if isinstance(written, dict) else {}
