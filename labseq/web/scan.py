@@ -59,15 +59,21 @@ class ScanView:
         is_reading = self._own is not None and self._own.n_unread > 0
         return is_reading or not all(fit.is_ready for fit in self._fits.values())
 
+    def recent(self, read_s: float) -> dict[str, Any]:
+        """The scan as it was a short time ago, so that most of the time is left for other work.
+
+        Args:
+            read_s: Time that may be spent on reading the files of shots, in seconds.
+        """
+        return self._values if time.monotonic() < self._next_s else self.values(read_s)
+
     def values(self, read_s: float) -> dict[str, Any]:
-        """The scan, JSON-ready; "error" if it cannot be shown.
+        """The scan as the files are now, JSON-ready; "error" if it cannot be shown.
 
         Args:
             read_s: Time that may be spent on reading the files of shots, in seconds.
         """
         start_s = time.monotonic()
-        if start_s < self._next_s:
-            return self._values
         try:
             self._values = self._compute(read_s)
         except (LabseqError, AttributeError, LookupError, TypeError, ValueError) as error:

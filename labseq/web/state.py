@@ -164,7 +164,7 @@ class RunState:
                 values = view.values(read_s=0.2)
                 if not view.is_busy or time.monotonic() > end_s:
                     return values
-            time.sleep(0.05)
+            time.sleep(0.1)
 
     def _scan(self, quantity: str) -> ScanView:
         view = self._scans.pop(quantity, None) or ScanView(self.run, quantity)
@@ -181,7 +181,7 @@ class RunState:
         except ConfigError as error:  # no such quantity
             return {"error": text_of(error, 600)}
         # a run needs its processor more
-        return {**view.values(read_s=0.03 if status == "running" else 0.3), "is_busy": view.is_busy}
+        return {**view.recent(read_s=0.03 if status == "running" else 0.3), "is_busy": view.is_busy}
 
     def _alarms(
         self, record: Mapping[str, Any], status: str, error: str, columns: Columns
