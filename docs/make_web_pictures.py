@@ -33,6 +33,7 @@ PICTURES = {
     "wall": ("/now?wall=1", "dark", 1600, 900),
     "shot": ("/runs/{compact}/shots/2", "light", 1280, 800),
     "scan": ("/scan?run={scan}", "light", 1280, 560),
+    "fit": ("/scan?run={lifetime}", "light", 1280, 640),
     "phone": ("/now", "light", 390, 844),
 }
 
@@ -86,10 +87,11 @@ def take(folder: Path = FOLDER, names: tuple[str, ...] = tuple(PICTURES), shots:
         data = Path(home) / "data"
         data.mkdir()
         run(data, "kagome", "--shots=12", "--seed=3")
-        scan = run(data, "scan_dop", "--seed=2")
+        lifetime, scan = run(data, "lifetime", "--seed=1"), run(data, "scan_dop", "--seed=2")
         compact = run(data, "compact_225", f"--shots={shots}", "--seed=1")
         stop_in_the_middle(compact)
-        runs = {"scan": f"{scan.parent.name}/{scan.name}", "compact": f"{compact.parent.name}/{compact.name}"}
+        folders = {"scan": scan, "lifetime": lifetime, "compact": compact}
+        runs = {name: f"{folder.parent.name}/{folder.name}" for name, folder in folders.items()}
         chromium: Any = started.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"]
         )
@@ -101,6 +103,8 @@ def take(folder: Path = FOLDER, names: tuple[str, ...] = tuple(PICTURES), shots:
                 )
                 page.goto(address + page_of.format(**runs))
                 page.locator("main[aria-busy='false'] h1").first.wait_for()
+                if name == "fit":
+                    page.locator(".fit-line strong").wait_for()
                 page.wait_for_timeout(1500)  # frames are loaded one by one
                 picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
                 picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(

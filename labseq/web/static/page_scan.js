@@ -3,7 +3,7 @@ import { go, setLink } from "./app.js";
 import { closeCharts, curve, heatMap } from "./charts.js";
 import { el, getJson, panel, patch, replace, runPath, table } from "./dom.js";
 import { follow } from "./live.js";
-import { axisName, fullText, scanCurve, shortName, titleOf, valueText } from "./measured.js";
+import { axisName, fitLine, fullText, scanCurve, shortName, titleOf, valueText } from "./measured.js";
 import { alarmList, headOf } from "./page_now.js";
 
 export async function showScan(main, _, asked) {
@@ -69,13 +69,13 @@ function makeParts(body, scan) {
 }
 
 function drawMaps(parts, scan) {
-  patch(parts.maps, scan.quantities.map((quantity, q) => el("div", {}, el("h3", {}, titleOf(quantity)),
+  patch(parts.maps, scan.quantities.map((quantity, q) => el("div", {}, el("h3", {}, titleOf(quantity)), fitLine(quantity.fit),
     heatMap(scan.axes, scan.points.map((p) => ({ i: p.place[0], j: p.place[1], value: p.values[q].value, text: `${p.written.join(", ")}: ${fullText(quantity, p.values[q])}` })), titleOf(quantity), (value) => valueText(quantity, value)))));
 }
 
 function drawVisits(parts, scan) {
   const points = scan.visits.map((visit, i) => ({ x: i, y: visit.value, text: `${i} (${Object.values(visit.written).join(", ")})` }));
-  if (points.length) curve(parts.visits, points, { x: "visit", label: scan.figure, format: (v) => Number(v.toPrecision(4)).toString(), ink: "blue", formatX: (x) => String(Math.round(x)), height: () => 240 });
+  if (points.length) curve(parts.visits, points, { x: "visit", label: scan.figure, format: (v) => Number(v.toPrecision(4)).toString(), ink: "blue", whole: true, formatX: (x) => String(Math.round(x)), height: () => 240 });
   patch(parts.best, scan.best ? [el("div.tile-value", {}, scan.best.value === null ? "–" : Number(scan.best.value.toPrecision(5)).toString()),
     el("dl.facts", {}, Object.entries(scan.best.written).map(([address, value]) => [el("dt", {}, address), el("dd", {}, value)]))] : el("p.hint", {}, "no point has a value yet"));
 }
