@@ -147,6 +147,7 @@ mobile_tweezers: {use: virtual}
 detector: {use: threshold, frame: [64, 64], centre_px: [31.5, 31.5]}
 simulation: {use: virtual, image: {frame: [64, 64], centre_px: [31.5, 31.5]}}
 devices: {lamp: {use: lamp}}
+alarms: {stop_after: 0}
 plugin_folders: [plugins]
 """
 SEQUENCE: Final = """

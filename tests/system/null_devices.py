@@ -74,6 +74,7 @@ static_tweezers: {use: nothing}
 mobile_tweezers: {use: nothing}
 detector: {use: nothing}
 plugin_folders: [plugins]
+alarms: {stop_after: 0}
 """
 SEQUENCE = """
 labseq: 1
