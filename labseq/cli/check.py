@@ -286,7 +286,16 @@ def _subject(assembly: Assembly) -> Facts:
         ("planner", assembly.planner.entry.name + (f" ({listed})" if listed else "")),
         *(("calibration", _calibration(entry)) for entry in assembly.hardware.calibrations.values()),
         *(("scan", text) for text in _scanned(assembly)),
+        *(("measures", _measure(one)) for one in assembly.resolved["measure"]),
     ]
+
+
+def _measure(measure: Mapping[str, Any]) -> str:
+    """A quantity that the run measures, and its fit."""
+    if "fit" not in measure:
+        return clean(measure["value"])
+    result = f", result {measure['report']}" if "report" in measure else ""
+    return f"{clean(measure['value'])}, fit {measure['fit']}{result}"
 
 
 def _calibration(entry: CalibrationEntry) -> str:
