@@ -125,6 +125,8 @@ shot: [{load: {}}, {image: {}}]
             True,
         ),
         ("shots: 1", "shots: 1\npolicy: {checks: [{at_least: 1}]}", False),
+        ("shots: 1", "shots: 1\nmeasure: [filling, {value: loading, fit: linear}]", True),
+        ("shots: 1", "shots: 1\nmeasure: [{fit: linear}]", False),
         ("shots: 1", "shots: 1\nvariables: {t: 20 ms, n: 3, f: 1.5 MHz, x: = 2 * variables.n}", True),
         ("shots: 1", "shots: 1\nvariables: {t: long}", False),
         ("shots: 1", "shots: = 2 * 3", True),
