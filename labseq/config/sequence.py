@@ -231,6 +231,10 @@ class SequenceSpec(Settings):
         default=PolicySettings(),
         description="reactions to failures, exceeded budgets and quantities out of range",
     )
+    alarms: bool = Field(
+        default=True,
+        description="whether shots give the alarms of the profile; false where no atoms are meant",
+    )
     plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
     scan: dict[str, Any] | list[dict[str, Any]] | None = Field(
         default=None, description="addresses whose values change from shot to shot"

@@ -33,7 +33,7 @@ class Alarms:
     """Looks at each shot of a run.
 
     Args:
-        settings: The limits.
+        settings: The limits; None for no alarms.
         warn: Receives the message when an alarm begins.
         wall_s: The computer's clock, which a user or a network may set.
         monotonic_s: A clock that nobody sets, and that stands still while the computer sleeps.
@@ -41,12 +41,13 @@ class Alarms:
 
     def __init__(
         self,
-        settings: AlarmSettings,
+        settings: AlarmSettings | None,
         warn: Callable[[str], None],
         wall_s: Callable[[], float] = time.time,
         monotonic_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._settings = settings
+        self._settings = settings or AlarmSettings()
+        self._is_on = settings is not None
         self._warn = warn
         self._clocks = wall_s, monotonic_s
         self._difference_s = wall_s() - monotonic_s()
@@ -57,7 +58,7 @@ class Alarms:
 
     def look(self, shot: ShotRecord) -> None:
         """Look at a shot that was taken; attempts that did not complete are left out."""
-        if shot.status != "complete":
+        if shot.status != "complete" or not self._is_on:
             return
         found = dict(self._signs(shot))
         self._in_a_row = {name: self._in_a_row.get(name, 0) + 1 for name in found}

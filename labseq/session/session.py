@@ -72,7 +72,9 @@ class Shots:
         self._run = run
         self._point = first
         self._writer = writer
-        self._alarms = Alarms(run.assembly.hardware.profile.alarms, run.warn)
+        assembly = run.assembly
+        limits = assembly.hardware.profile.alarms if assembly.sequence.alarms else None
+        self._alarms = Alarms(limits, run.warn)
         self.sequencer = Sequencer(
             lab,
             first.steps,
