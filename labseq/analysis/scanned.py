@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from labseq.console.report import aligned
 from labseq.console.text import count_of
 from labseq.data import Run
 from labseq.data.columns import Column, make_column
+from labseq.data.fits import Fit
 from labseq.data.points import ScanPoint
 from labseq.data.quantities import (
     Quantity,
@@ -25,6 +26,9 @@ from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.units import UNITS, dimension_of, readable_unit
+
+MAX_CHI_SQUARE: Final = 4.0
+"""Reduced chi-square above which the summary warns: errors are then too small by a factor of 2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,12 +219,14 @@ def results_of(run: Run, report: ScanReport) -> list[tuple[str, str]]:
     """The results of a run: name and value of the parameter that its sequence asks for, in each fit."""
     reported = {one["value"]: one.get("report") for one in measures_of(run)}
     rows: list[tuple[str, str]] = []
+    is_one = sum(map(bool, report.fits)) == 1
     for (quantity, _), fits in zip(report.values, report.fits, strict=False):
         for at in fits:
             name = reported.get(quantity.name) or (next(iter(at.fit.free), "") if at.fit else "")
             if at.fit is not None and name in at.fit.parameters:
                 where = "".join(f", {word}" for word in at.written.values())
-                rows.append((f"{name}{where}", str(at.fit.parameters[name])))
+                of = "" if is_one else f" of {title_of(quantity)}"
+                rows.append((f"{name}{of}{where}", f"{at.fit.parameters[name]}{_doubt(at.fit)}"))
             elif at.problem:
                 rows.append((title_of(quantity), at.problem))
     return rows
@@ -230,6 +236,13 @@ def _aim(run: Run) -> tuple[str, ...]:
     """The quantity that an adaptive scan optimises, unless it is shown anyway."""
     name = str(run.scan.get("figure") or "")
     return (name,) if name and name not in {"filling_fraction", "success"} else ()
+
+
+def _doubt(fit: Fit) -> str:
+    """What a value's error does not tell: that the points do not follow the model."""
+    if fit.reduced_chi_square <= MAX_CHI_SQUARE or math.isnan(fit.reduced_chi_square):
+        return ""
+    return f" (reduced chi-square {fit.reduced_chi_square:.2g}: the points do not follow the model)"
 
 
 def fit_lines(fits: Sequence[FitAt]) -> list[str]:

@@ -152,7 +152,7 @@ def parse(line: str, *, is_prose: bool) -> None:
     if "--help" in words:
         return
     if words or not is_prose:  # prose may name a command without its arguments
-        command.make_context(line, words)
+        command.make_context(line, words).close()  # which takes back what --plugins has set
 
 
 def test_the_error_in_the_reference_is_what_labseq_says(
