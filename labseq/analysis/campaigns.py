@@ -169,7 +169,8 @@ def campaign_picture(folder: Path) -> RunPicture:
     places = tuple(tuple(point[i] for i in varied) for point in points)
     scan = Scanned(axes, places, tuple(ScanPoint({}, {}, point_shots) for point_shots in shots))
     names = measured_by(_first(runs))
-    rows = tuple(row for name in names if (row := scan_panels(scan, _over_runs(runs, name))))
+    quantities = [_over_runs(runs, name) for name in names]
+    rows = tuple(row for one in quantities if (row := scan_panels(scan, one, scan.over(one))))
     if not rows:
         raise ConfigError(Problem("the campaign has no shots to draw yet", visible(str(folder))))
     note = "; ".join([plural(sum(map(len, shots)), "shot"), *_missing(campaign, runs)])

@@ -129,8 +129,8 @@ def overview(run: Run) -> RunPicture:
     names = measured_by(run)
     measured = (_quantity_row(summary, name) for name in names)
     rows = [_present(*(row or ()), panel) for row, panel in zip_longest(measured, beside)]
-    if summary.scan is not None:  # a single map is in the row of its quantity
-        rows += [maps for name in names if len(maps := scan_panels(summary.scan, summary.quantity(name))) > 1]
+    # a single panel is in the row of its quantity
+    rows += [panels for name in names if len(panels := summary.scan_row(name)) > 1]
     rows.append(_present(*survival_panels(run, survival), stages_panel(run, timing)))
     return _picture(run, f"run {clean(run.name)}", rows)
 
@@ -231,9 +231,17 @@ def stages_panel(run: Run, timing: RunTiming) -> Panel | None:
     return stages_of_a_shot(f"stages of a shot{part_text(timing.n_read, run)}", stages, clocks)
 
 
-def scan_panels(scan: Scanned, quantity: Quantity, fits: Sequence[FitAt] = ()) -> Row:
-    """A quantity against the scanned values: a curve for one axis, maps for more; empty if it is unknown."""
-    means = scan.over(quantity)
+def scan_panels(
+    scan: Scanned, quantity: Quantity, means: Sequence[Estimated], fits: Sequence[FitAt] = ()
+) -> Row:
+    """A quantity against the scanned values: a curve for one axis, maps for more; empty if it is unknown.
+
+    Args:
+        scan: The points.
+        quantity: The quantity.
+        means: Its mean at each point.
+        fits: Its fits.
+    """
     values = [mean.value for mean in means if not math.isnan(mean.value)]
     if not values:
         return ()
@@ -354,8 +362,8 @@ def scan_picture(run: Run, request: ScanRequest) -> RunPicture:
         raise cannot_draw(run, "it has no scan", expected)
     fits = report.fits or ((),) * len(report.values)
     rows = [
-        scan_panels(report.scan, quantity, fits_of_quantity)
-        for (quantity, _), fits_of_quantity in zip(report.values, fits, strict=True)
+        scan_panels(report.scan, quantity, means, fits_of_quantity)
+        for (quantity, means), fits_of_quantity in zip(report.values, fits, strict=True)
     ]
     panels = [panel for row in rows for panel in row]
     return _picture(run, "the scan", [tuple(panels)] if len(panels) <= MAX_PANELS else rows)
@@ -371,6 +379,7 @@ class _Summary:
     def __init__(self, run: Run, max_read: int) -> None:
         self.run = run
         self._max_read = max_read
+        self._scan_rows: dict[str, Row] = {}
 
     @cached_property
     def statistics(self) -> Statistics:
@@ -385,6 +394,17 @@ class _Summary:
     def quantity(self, name: str) -> Quantity:
         """A quantity of the run."""
         return quantity_of(self.run, name)
+
+    def scan_row(self, name: str) -> Row:
+        """A quantity at the points of the scan, with the fits of the sequence; empty without a scan."""
+        if self.scan is None:
+            return ()
+        if name not in self._scan_rows:
+            quantity = self.quantity(name)
+            means = self.scan.over(quantity)
+            fits = own_fits(self.run, self.scan, quantity, means)
+            self._scan_rows[name] = scan_panels(self.scan, quantity, means, fits)
+        return self._scan_rows[name]
 
     @cached_property
     def read(self) -> tuple[Survival, RunTiming]:
@@ -403,14 +423,8 @@ class _Summary:
 def _quantity_row(summary: _Summary, name: str) -> Row:
     """A quantity against shot, cycle and scanned value, where available."""
     quantity = summary.quantity(name)
-    scan, run = summary.scan, summary.run
-    maps = (
-        ()
-        if scan is None
-        else scan_panels(scan, quantity, own_fits(run, scan, quantity, scan.over(quantity)))
-    )
+    panels, shots = summary.scan_row(name), summary.run.shots
     by_cycle = cycles_panel(quantity, summary.statistics) if name in WITH_TARGET else None
-    shots = run.shots
     values = np.array([quantity.of_shot(shot) for shot in shots])
     indices = np.array([float(shot.index) for shot in shots])
     unit, factor = shown_unit(quantity, values.tolist())
@@ -422,7 +436,7 @@ def _quantity_row(summary: _Summary, name: str) -> Row:
         unit=unit,
         scale=1 / factor,
     )
-    return _present(by_shot, by_cycle, *(maps if len(maps) == 1 else ()))
+    return _present(by_shot, by_cycle, *(panels if len(panels) == 1 else ()))
 
 
 def _scan_rows(summary: _Summary) -> list[Row]:

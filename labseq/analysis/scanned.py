@@ -21,7 +21,7 @@ from labseq.data.quantities import (
     measures_of,
     quantity_of,
 )
-from labseq.data.scanned import FitAt, FitRequest, Scanned, fits_along, scanned
+from labseq.data.scanned import FitAt, FitRequest, Scanned, fits_along, request_of, scanned
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate, Estimated, Rate
@@ -208,8 +208,7 @@ def own_fits(run: Run, scan: Scanned, quantity: Quantity, means: Sequence[Estima
     if wanted is None or not scan.axes:
         return []
     try:
-        request = FitRequest(wanted["fit"], wanted.get("parameters", {}))
-        return fits_along(run, scan, quantity, means, request)
+        return fits_along(run, scan, quantity, means, request_of(wanted))
     except ConfigError as error:
         problem = "; ".join(problem.what for problem in error.problems)
         return [FitAt({}, {}, None, f"no fit {wanted['fit']}: {problem}")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -161,6 +161,11 @@ class FitRequest:
     along: str | None = None
 
 
+def request_of(measure: Mapping[str, Any]) -> FitRequest:
+    """The fit of an entry of ``measure`` that has one, see :func:`labseq.data.quantities.measures_of`."""
+    return FitRequest(measure["fit"], measure.get("parameters") or {})
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FitAt:
     """The fit at one combination of the values of the other axes.
@@ -204,27 +209,13 @@ def fits_along(
         groups.setdefault((*place[:i_along], *place[i_along + 1 :]), []).append(i)
     others = [axis for axis in scan.axes if axis is not scan.axes[i_along]]
     numbers, unit = scan.on_axis(i_along) or ([], "")
-    x = [factor_of(unit) * number for number in numbers]
-    profile: Mapping[str, Any] = (run.record.get("resolved") or {}).get("profile") or {}
-    lab_model = None
-    if request.model not in MODELS:
-        from labseq.data.lab_models import find_lab_model  # loading plugins takes a while
-
-        lab_model = find_lab_model(run, request.model)
+    fit_of = fitter(run, quantity, unit, request)
     fits: list[FitAt] = []
     errors: list[ConfigError] = []
     for place, members in sorted(groups.items()):
         fit, problem = None, ""
         try:
-            fit = fit_points(
-                request.model,
-                [x[i] for i in members],
-                [means[i] for i in members],
-                (si_unit_of(f"1 {unit}"), "%" if quantity.is_fraction else quantity.unit),
-                request.given,
-                profile.get("simulation") or {},
-                lab_model,
-            )
+            fit = fit_of([numbers[i] for i in members], [means[i] for i in members])
         except ConfigError as error:
             errors.append(error)
             problem = "; ".join(problem.what for problem in error.problems)
@@ -234,6 +225,37 @@ def fits_along(
     if errors and len(errors) == len(fits):
         raise errors[0]
     return fits
+
+
+def fitter(
+    run: Run, quantity: Quantity, unit: str, request: FitRequest
+) -> Callable[[Sequence[float], Sequence[Estimated]], Fit]:
+    """What fits points of a quantity: takes the scanned values, in ``unit``, and the mean at each.
+
+    It raises as :func:`labseq.data.fits.fit_points` does.
+
+    Raises:
+        ConfigError: There is no such model.
+    """
+    profile: Mapping[str, Any] = (run.record.get("resolved") or {}).get("profile") or {}
+    lab_model = None
+    if request.model not in MODELS:
+        from labseq.data.lab_models import find_lab_model  # loading plugins takes a while
+
+        lab_model = find_lab_model(run, request.model)
+
+    def fit(x: Sequence[float], means: Sequence[Estimated]) -> Fit:
+        return fit_points(
+            request.model,
+            [factor_of(unit) * number for number in x],
+            means,
+            (si_unit_of(f"1 {unit}"), "%" if quantity.is_fraction else quantity.unit),
+            request.given,
+            profile.get("simulation") or {},
+            lab_model,
+        )
+
+    return fit
 
 
 def _axis_number(scan: Scanned, address: str | None) -> int:

@@ -11,13 +11,13 @@ from typing import Any, Final
 import numpy as np
 
 from labseq.data import Run
-from labseq.data.fit_models import MODELS
-from labseq.data.fits import Fit, fit_points
+from labseq.data.fits import Fit
 from labseq.data.quantities import Quantity
+from labseq.data.scanned import fitter, request_of
 from labseq.errors import ConfigError
 from labseq.messages import format_error
 from labseq.model.estimate import Estimated
-from labseq.units import factor_of, si_unit_of
+from labseq.units import factor_of
 from labseq.web.runs import text_of
 from labseq.web.series import finite, interval_of
 
@@ -97,21 +97,8 @@ class LiveFit:
         self._fitted_points = text
 
     def _fitted(self, points: Points) -> dict[str, Any]:
-        factor, model, lab_model = factor_of(points.unit), self._measure["fit"], None
-        if model not in MODELS:
-            from labseq.data.lab_models import find_lab_model  # loading plugins takes a while
-
-            lab_model = find_lab_model(self._run, model)
-        profile: Mapping[str, Any] = (self._run.record.get("resolved") or {}).get("profile") or {}
-        fit = fit_points(
-            model,
-            [factor * x for x in points.x],
-            points.values,
-            (si_unit_of(f"1 {points.unit}"), "%" if self._quantity.is_fraction else self._quantity.unit),
-            self._measure.get("parameters") or {},
-            profile.get("simulation") or {},
-            lab_model,
-        )
+        factor, request = factor_of(points.unit), request_of(self._measure)
+        fit = fitter(self._run, self._quantity, points.unit, request)(points.x, points.values)
         curve = np.linspace(min(points.x), max(points.x), 201)
         residuals = zip(points.x, points.values, fit.at(factor * np.array(points.x)).tolist(), strict=True)
         return {

@@ -5,12 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Mapping
 from typing import Any, Final
 
 from labseq.data import Shot, open_run
 from labseq.data.points import ScanPoint
-from labseq.data.quantities import column_names, find_quantity, image_names, make_quantity
+from labseq.data.quantities import column_names, find_quantity, image_names, make_quantity, measures_of
 from labseq.data.scanned import Scanned, scanned
 from labseq.errors import LabseqError
 from labseq.model.estimate import Estimated
@@ -43,10 +42,10 @@ class ScanView:
         if quantity and quantity not in run.shown:
             self._own = Series(find_quantity(_first_shots(run), quantity), run.folder)
         self._names = (quantity,) if quantity else run.shown
-        resolved: Mapping[str, Any] = run.record.get("resolved") or {}
+        empty = run.some(())
         self._fits = {
-            one["value"]: LiveFit(make_quantity(one["value"], run.target), one, run.some(()))
-            for one in resolved.get("measure") or ()
+            one["value"]: LiveFit(make_quantity(one["value"], run.target), one, empty)
+            for one in measures_of(empty)
             if one.get("fit") and one["value"] in self._names
         }
         self._choices: list[str] = []

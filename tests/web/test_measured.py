@@ -152,7 +152,7 @@ def test_the_page_goes_on_while_a_model_hangs(tmp_path: Path, monkeypatch: pytes
         release.wait(60.0)
         raise ZeroDivisionError("the model\nfailed")
 
-    monkeypatch.setattr("labseq.web.fitting.fit_points", hang)
+    monkeypatch.setattr("labseq.data.scanned.fit_points", hang)
     writer = scan_of_holds(tmp_path, 4)
     client = client_of(tmp_path)
     path = f"{path_of(writer.run_dir)}/state"
