@@ -7,7 +7,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence, Sized
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any, Final, TextIO
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -22,7 +22,7 @@ from labseq.cli.tally import ScanTally, Tally
 from labseq.console.arrays import Glyphs, draw_array, glyphs_for, scales
 from labseq.console.events import LASTING, LogLines, event_text
 from labseq.console.text import clock_time, count_of, plural
-from labseq.data.measured import Measured, Sums
+from labseq.data.series import Series
 from labseq.model import RunRecord
 from labseq.model.estimate import jeffreys
 from labseq.units import format_quantity
@@ -279,18 +279,20 @@ _LEAST_RANGE: Final = 0.01
 
 
 def draw_scan(
-    scan: ScanTally, measured: Sequence[Measured], width: int, height: int, glyphs: Glyphs
+    scan: ScanTally, measured: Sequence[Series], width: int, height: int, glyphs: Glyphs
 ) -> list[Text]:
     """Draw the first quantity that has values, at each point of a scan."""
-    known = next((one for one in measured if one.total.n_shots), None)
-    if known is None or width < MIN_WIDTH or height < MIN_HEIGHT:
+    points = scan.points()
+    if not points or width < MIN_WIDTH or height < MIN_HEIGHT:
         return []
-    quantity, points = known.quantity, scan.points()
-    shown = _merged([known.at_points.get(number, Sums()) for _, number in points], width - _LABEL)
-    values = [sums.mean(is_rate=quantity.is_rate).value if sums.n_shots else None for sums in shown]
-    there = [value for value in values if value is not None]
-    if not there:
+    shown = _merged([lines for _, lines in points], width - _LABEL)
+    for series in measured:
+        means = [mean.value for mean in series.over(shown)]
+        if there := [value for value in means if not math.isnan(value)]:
+            break
+    else:
         return []
+    quantity, values = series.quantity, [None if math.isnan(value) else value for value in means]
     unit, factor = shown_unit(quantity, there)
     high = max(there)
     low = 0.0 if quantity.is_rate else min(high - _LEAST_RANGE * (abs(high) or 1.0), *there)
@@ -309,17 +311,11 @@ def draw_scan(
     ]
 
 
-def _merged(points: Sequence[Sums], room: int) -> list[Sums]:
-    """The points, with neighbours added up if there is no room for all."""
+def _merged(points: Sequence[Sequence[int]], room: int) -> list[list[int]]:
+    """The shots of the points, with neighbours put together if there is no room for all."""
     n = min(len(points), max(1, room))
-    ends = [round(i * len(points) / n) for i in range(n + 1)] if n else []
-    merged: list[Sums] = []
-    for first, end in pairwise(ends):
-        total = Sums()
-        for point in points[first:end]:
-            total += point
-        merged.append(total)
-    return merged
+    ends = [round(i * len(points) / n) for i in range(n + 1)]
+    return [list(chain.from_iterable(points[first:end])) for first, end in pairwise(ends)]
 
 
 def _bars(

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from labseq.console.events import best_text, scanned_names
-from labseq.data.measured import Measured
 from labseq.data.points import ChosenPoints
-from labseq.data.quantities import names_measured
-from labseq.data.shot import Shot
+from labseq.data.quantities import make_quantity, names_measured
+from labseq.data.series import Series
 from labseq.model import ImageRecord, RunRecord, StageTiming
 from labseq.recording.index import IndexRow
 from labseq.recording.run_file import SCANNER
@@ -61,35 +61,39 @@ class StageTally:
 
 
 class ScanTally:
-    """The points of a scan while it runs."""
+    """The points of a scan while it runs.
+
+    Attributes:
+        lines: Number of a point -> the shots taken there, by their places in a :class:`Series`.
+    """
 
     def __init__(self, scan: Mapping[str, Any]) -> None:
         self._scan = scan
         self._chosen = ChosenPoints(scan) if SCANNER in scan else None
+        self.lines = defaultdict[int, list[int]](list)
 
     @property
     def name(self) -> str:
         """The scanned settings, as text."""
         return ", ".join(scanned_names(self._scan))
 
-    def number(self, row: IndexRow) -> int | None:
-        """Number of the point of a shot; None if it is unknown."""
-        try:
+    def add(self, row: IndexRow, line: int) -> None:
+        """Add a shot to its point, unless that is unknown."""
+        with suppress(KeyError, IndexError):  # `labseq watch` on a damaged index
             if self._chosen is not None:
-                return self._chosen.number(row.parameters)
-            return self._scan["point_of_shot"][row.shot] if row.shot >= 0 else None
-        except (KeyError, IndexError):  # `labseq watch` on a damaged index
-            return None
+                self.lines[self._chosen.number(row.parameters)].append(line)
+            elif row.shot >= 0:
+                self.lines[self._scan["point_of_shot"][row.shot]].append(line)
 
-    def points(self) -> list[tuple[str, int]]:
-        """The value of each point as text, and its number; sorted by value if one number is scanned."""
+    def points(self) -> list[tuple[str, list[int]]]:
+        """The value of each point as text, and its shots; sorted by value if one number is scanned."""
         chosen = self._chosen
         written: list[list[str]] = self._scan.get("written", []) if chosen is None else chosen.written
         values: list[list[Any]] = self._scan.get("points", []) if chosen is None else chosen.points
         order = list(range(len(written)))
         if all(len(value) == 1 and isinstance(value[0], float | int) for value in values):
             order.sort(key=lambda i: values[i][0])
-        return [(", ".join(written[i]), i) for i in order]
+        return [(", ".join(written[i]), self.lines.get(i, [])) for i in order]
 
 
 class Tally:
@@ -116,14 +120,13 @@ class Tally:
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
         self._first_shot_s = math.nan
-        self._run_dir = Path()
         self.record: RunRecord | None = None
         self.n_before = self.n_done = self.n_judged = self.n_defect_free = self.n_seen = self.n_repeated = 0
         self.image: ImageRecord | None = None
         self.image_shot = self.shot = 0
         self.stages = {name: StageTally() for name in STAGES}
         self.scan: ScanTally | None = None
-        self.measured: list[Measured] = []
+        self.measured: list[Series] = []
         self.best = ""
         self.status = ""
 
@@ -166,26 +169,27 @@ class Tally:
                 pass
 
     def _begin(self, record: RunRecord, run_dir: Path, n_before: int) -> None:
-        self.record, self._run_dir, self.status = record, run_dir, ""
+        self.record, self.status = record, ""
         self.n_before = n_before - self.n_done  # `watch` has counted them itself
         if self.scan is None and record.scan:  # the points of a resumed run are kept
             self.scan = ScanTally(record.scan)
         if not self.measured:
             names = names_measured(record.resolved, record.target)
-            self.measured = [Measured(name, record.target, run_dir) for name in names]
+            self.measured = [Series(make_quantity(name, record.target), run_dir) for name in names]
 
     def _count(self, row: IndexRow) -> None:
         if not row.counts:
             return
+        if self.scan is not None:
+            self.scan.add(row, len(self.measured[0]))
         self.n_done += 1
         self.n_judged += not math.isnan(row.filling_fraction)
         self.n_defect_free += bool(row.success)
         self.n_seen += row.was_defect_free
-        point = None if self.scan is None else self.scan.number(row)
         for measured in self.measured:
-            measured.add(Shot(self._run_dir, row), point)
+            measured.add(row)
 
     def look(self) -> None:
         """Add the results of analyses that have come."""
         for measured in self.measured:
-            measured.look()
+            measured.read_results()

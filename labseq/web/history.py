@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from labseq.analysis.statistics import LOST
 from labseq.data import Shot
 from labseq.data.follower import Follower
+from labseq.data.series import Series
 from labseq.errors import RecordingError
 from labseq.files import lines_in
 from labseq.model.estimate import Estimate, Rate, mean
 from labseq.plain import parse_object
 from labseq.recording.folders import INDEX_FILE
 from labseq.recording.index import IndexRow, row_of_line
-from labseq.web.series import Series, about_quantity, finite, interval_of, mean_values
+from labseq.web.series import about_quantity, finite, interval_of, mean_values
 
 _NUMBERS: Final[Mapping[str, Callable[[IndexRow], float]]] = {
     "success": lambda row: math.nan if row.success is None else row.success,
@@ -77,7 +78,7 @@ class RunHistory:
                 else:
                     self._add(row, start)
             for series in self._series:
-                series.read(self._shot_of)
+                series.read_results()
 
     def _shot_of(self, line: int) -> Shot:
         return self._follower.shot(self._row(line))

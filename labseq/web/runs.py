@@ -18,6 +18,7 @@ from labseq.data import Run, Shot
 from labseq.data.follower import Event, Follower
 from labseq.data.points import reporting_damage
 from labseq.data.quantities import WITH_TARGET, make_quantity, names_measured, quantity_problem
+from labseq.data.series import Series
 from labseq.errors import RecordingError
 from labseq.files import read_file, write_file
 from labseq.messages import visible
@@ -26,7 +27,6 @@ from labseq.plain import dumps, now_utc, parse_object
 from labseq.recording.folders import INDEX_FILE, NOTES_FILE, RUN_FILE, STATE_FILE, runs_in
 from labseq.recording.run_file import read_run, read_state, target_of
 from labseq.web.history import RunHistory, judged_values
-from labseq.web.series import Series
 
 MAX_TEXT: Final = 2000
 """Maximum number of characters of a text from a file that is passed on."""

@@ -11,12 +11,13 @@ from labseq.data import Shot, open_run
 from labseq.data.points import ScanPoint
 from labseq.data.quantities import column_names, find_quantity, image_names, make_quantity, measures_of
 from labseq.data.scanned import Scanned, scanned
+from labseq.data.series import Series
 from labseq.errors import LabseqError
 from labseq.model.estimate import Estimated
 from labseq.recording.run_file import SCANNER
 from labseq.web.fitting import LiveFit, points_to_fit
 from labseq.web.runs import OpenRun, text_of
-from labseq.web.series import Series, about_quantity, finite, mean_values
+from labseq.web.series import about_quantity, finite, mean_values
 
 _MAX_POINTS: Final = 2000
 """Maximum number of points of a scan, and of visits of points."""
@@ -87,7 +88,8 @@ class ScanView:
         if self._own is not None:
             for row in run.history.rows(len(self._own)):
                 self._own.add(row)
-            self._own.read(run.shot, read_s)
+            self._own.read_results()
+            self._own.read_files(run.shot, read_s)
         if not self._choices and len(run.history):
             self._choices = _choices(run)
         head = {
