@@ -221,11 +221,11 @@ def run_queue(
     _plugins: Plugins = None,
 ) -> None:
     """Run the queued entries one after the other; a run that was interrupted is resumed first."""
-    from labseq.cli.run import run_session
+    from labseq.cli.run import calibrate_for_queue, run_session
     from labseq.queue.running import run_entries
 
     run = partial(run_session, as_json=False)
-    raise typer.Exit(run_entries(run, keep_going=keep_going, watch=watch))
+    raise typer.Exit(run_entries(run, calibrate_for_queue, keep_going=keep_going, watch=watch))
 
 
 @campaign.command("run", short_help="Take the runs of a campaign file.")
@@ -338,11 +338,26 @@ def show(
 
 
 @app.command(short_help="Watch a run that another process takes.")
-def watch(run: RunFolder = None) -> None:
+def watch(
+    run: RunFolder = None,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Wait for the next run then, and watch it, until Ctrl-C.")
+    ] = False,
+) -> None:
     """Watch a run that another process takes, until it ends. Ctrl-C ends only the view."""
     from labseq.cli.watch import watch_run
 
-    watch_run(run)
+    watch_run(run, follow=follow)
+
+
+@app.command(short_help="Send a notice, to try notify.yaml.")
+def notify(
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="What it says.")] = "a notice to try the way",
+) -> None:
+    """Send a notice by every way that notify.yaml in the data folder names, and say what failed."""
+    from labseq.cli.run import try_notice
+
+    try_notice(text)
 
 
 app.command(epilog=PLOT_EXAMPLES, short_help="Draw a run, or one of its shots.")(plot)

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from labseq.assembly.options import Options
+from labseq.assembly.options import DryRun, Options
 from labseq.console.events import LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.runs import folder_of_run
@@ -20,9 +20,10 @@ from labseq.console.text import plural, quoted
 from labseq.data import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.files import packaged_profiles_dir, packaged_sequences_dir
-from labseq.messages import install_hint, visible
+from labseq.messages import install_hint, listing, visible
 from labseq.queue.queue import Queue
 from labseq.recording import data_root
+from labseq.recording.folders import NOTIFY_FILE
 from labseq.roles import RunObserver
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop, find_running, is_running, owner_text, running_here
@@ -80,6 +81,36 @@ def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bo
         with suppress(Exception):  # a broken terminal must not hide the result of the run
             observer.close()
         _print_result(None if session is None else session.run_dir, failure, answer)
+
+
+def calibrate_for_queue(kind: str, profile: str, dry_run: DryRun) -> None:
+    """Take a calibration that an entry of the queue needs, and print it."""
+    from labseq.calibration.measure import CalibrationRequest  # only a queue that calibrates needs it
+    from labseq.calibration.terminal import calibrate_kind
+
+    say(f"queue: calibrating {kind}")
+    calibrate_kind(kind, CalibrationRequest(profile, dry_run=dry_run), as_json=False)
+
+
+def try_notice(text: str) -> None:
+    """Send a notice by every way that ``notify.yaml`` names.
+
+    Raises:
+        ConfigError: There is no such file, it has an error, or a way failed.
+    """
+    from labseq.session.notices import Notices  # what other commands do not need
+    from labseq.session.send_notice import send
+
+    path = data_root() / NOTIFY_FILE
+    settings = Notices.read().settings
+    if settings is None:
+        expected = "a file with 'labseq: 1' and 'command' or 'webhook'"
+        raise ConfigError(Problem("there is no such file", visible(str(path)), expected=expected))
+    notice = {"kind": "test", "run": "", "text": f"labseq: {text}"}
+    task = {"command": settings.command, "webhook": settings.webhook, "notice": notice}
+    if failures := send(task):
+        raise ConfigError([Problem(failure, visible(str(path))) for failure in failures])
+    say(f"sent to {listing([*settings.command[:1], *([settings.webhook] if settings.webhook else [])])}")
 
 
 def _print_result(

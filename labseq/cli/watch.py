@@ -12,16 +12,36 @@ from typing import TextIO
 from labseq.cli.live import observer_for
 from labseq.cli.summary import Summary
 from labseq.console.output import say
-from labseq.console.runs import folder_of_run
+from labseq.console.runs import folder_of_run, newest_run
 from labseq.data import open_run
 from labseq.data.follower import Follower
+from labseq.files import data_root
 
 
 def watch_run(
-    path: Path | None, stream: TextIO | None = None, wait: Callable[[float], None] = time.sleep
+    path: Path | None,
+    stream: TextIO | None = None,
+    wait: Callable[[float], None] = time.sleep,
+    *,
+    follow: bool = False,
 ) -> None:
-    """Show a run until it ends, then print its summary; only its files are read."""
+    """Show a run until it ends, then print its summary; only its files are read.
+
+    Args:
+        follow: Whether to wait for the next run in the data folder then, and show that, until Ctrl-C.
+    """
     run_dir, shown = folder_of_run(path), stream or sys.stdout
+    try:
+        _watch_one(run_dir, shown, wait)
+        while follow:
+            while (newest := newest_run(data_root())) == run_dir:
+                wait(0.5)
+            _watch_one(run_dir := newest, shown, wait)
+    except KeyboardInterrupt:
+        say(f"no longer watched; the run {run_dir} continues if it is not over", stream=shown)
+
+
+def _watch_one(run_dir: Path, shown: TextIO, wait: Callable[[float], None]) -> None:
     follower = Follower(run_dir)
     view = observer_for(shown, follower.now)
     try:
@@ -34,10 +54,6 @@ def watch_run(
             view.refresh()
             if not is_over:
                 wait(0.5)
-    except KeyboardInterrupt:
-        lines = [f"no longer watched; the run {run_dir} continues"]
-    else:
-        lines = Summary.of(open_run(run_dir)).as_text()
     finally:
         view.close()
-    say(*lines, stream=shown)
+    say(*Summary.of(open_run(run_dir)).as_text(), stream=shown)

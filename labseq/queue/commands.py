@@ -1,5 +1,6 @@
 """The commands of `labseq queue`; `labseq queue run` is in `labseq.cli.app`."""
 
+from enum import StrEnum
 from typing import Annotated
 
 import typer
@@ -30,8 +31,18 @@ ADD_EXAMPLES = """\b
 Examples:
   labseq queue add sequences/compact_225.yaml
   labseq queue add sequences/scan_dop.yaml --shots 8 --profile lab
+  labseq queue add lifetime --if-fails skip --until 06:00 --needs thresholds=2h
   labseq queue run
 """
+
+
+class IfFailsKind(StrEnum):
+    """What happens if the run of an entry fails."""
+
+    STOP = "stop"
+    SKIP = "skip"
+    RETRY = "retry"
+
 
 Id = Annotated[
     int,
@@ -51,6 +62,28 @@ def add(
     overrides: Overrides = None,
     output: Output = None,
     realtime: Realtime = False,
+    if_fails: Annotated[
+        IfFailsKind,
+        typer.Option(
+            "--if-fails", help="End the queue if this run fails, skip it, or resume it once and go on then."
+        ),
+    ] = IfFailsKind.STOP,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Take no shot of it after this time, such as 06:00 or '2026-11-30 06:00'.",
+            show_default=False,
+        ),
+    ] = None,
+    needs: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND=AGE",
+            help="Calibrate before it unless the calibration in use is younger, such as thresholds=2h.",
+            show_default=False,
+        ),
+    ] = None,
     _plugins: Plugins = None,
 ) -> None:
     """Check a sequence and add it at the end of the queue.
@@ -58,18 +91,18 @@ def add(
     The entry keeps the text of the sequence as it is now: later changes of the file have no effect on it.
     """
     from labseq.assembly.options import Options
-    from labseq.queue.running import add_entry
+    from labseq.queue.running import add_entry, rules_from
 
     options = Options(
         profile, shots, seed, tuple(overrides or ()), output, dry_run_mode(dry_run), realtime=realtime
     )
-    add_entry(sequence, options)
+    add_entry(sequence, options, rules_from(if_fails.value, until, needs or ()))
 
 
 @queue.command(name="list", short_help="List the entries in order.")
 def list_(as_json: Json = False) -> None:
-    """List the entries in the order in which they will run, and those whose runs ended early."""
-    from labseq.queue.running import list_entries
+    """List the entries that are done since yesterday, that ended early, and that wait, in order."""
+    from labseq.queue.listing import list_entries
 
     list_entries(as_json=as_json)
 
@@ -84,6 +117,14 @@ def remove(
     from labseq.queue.queue import Queue
 
     Queue(data_root()).remove(ids)
+
+
+@queue.command(short_help="Let an entry wait again that was stopped, failed or was skipped.")
+def resume(entry: Id) -> None:
+    """Let an entry wait again that was stopped, failed or was skipped; the queue then resumes its run."""
+    from labseq.queue.queue import Queue
+
+    Queue(data_root()).wait_again(entry)
 
 
 @queue.command(short_help="Move an entry before another one.")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from datetime import datetime
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,7 @@ from labseq.config.document import StoredText
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import explained, read_file, write_file
 from labseq.messages import visible
-from labseq.plain import dumps, now_utc, parse_object
+from labseq.plain import dumps, now, now_utc, parse_object
 from labseq.processes import Holder, Lock, Process
 from labseq.recording.folders import STOP_FILE
 from labseq.recording.run_file import read_state
@@ -31,9 +31,34 @@ PAUSE_FILE: Final = "PAUSE"
 """Exists while the queue is paused."""
 FORMAT: Final = 1
 """Version of an entry's file."""
-EntryStatus = Literal["waiting", "running", "stopped", "failed"]
+DONE_FOLDER: Final = "done"
+"""Holds the entries whose runs are complete, for the list of the next morning."""
+EntryStatus = Literal["waiting", "running", "stopped", "failed", "skipped", "complete"]
+IfFails = Literal["stop", "skip", "retry"]
 
 _NUMBER: Final = re.compile(r"(\d{4,})\.(?:json|id)")
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What an entry asks of the process that runs the queue.
+
+    Attributes:
+        if_fails: "stop": the queue ends if its run fails; "skip": the queue continues; "retry": its run is
+            resumed or begun once more, then the queue continues.
+        until_utc: It begins no shot after this time, ISO 8601, UTC; "" for no such time.
+        needs: Kind of calibration -> the greatest age in seconds that it may have when the run begins; an
+            older one is taken again before.
+    """
+
+    if_fails: IfFails = "stop"
+    until_utc: str = ""
+    needs: Mapping[str, float] = field(default_factory=dict[str, float])
+
+    @property
+    def is_too_late(self) -> bool:
+        """Whether its time is over."""
+        return bool(self.until_utc) and now() >= datetime.fromisoformat(self.until_utc)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +76,11 @@ class Entry:
         run_dir: The folder of its run, once there is one.
         error: Why it did not start or ended early; or "".
         owner: The process that runs it, or did.
+        rules: What it asks of the process that runs the queue.
+        expected_s: How long its run takes, in seconds; None if that is unknown, as in virtual time.
+        n_failures: Number of times that its run has failed.
+        begun_utc: When its run began or was resumed, ISO 8601, UTC; or "".
+        ended_utc: When its run ended; or "".
     """
 
     id: int
@@ -63,6 +93,11 @@ class Entry:
     run_dir: Path | None = None
     error: str = ""
     owner: Process | None = None
+    rules: Rules = Rules()
+    expected_s: float | None = None
+    n_failures: int = 0
+    begun_utc: str = ""
+    ended_utc: str = ""
 
     @property
     def stored_text(self) -> StoredText:
@@ -113,21 +148,61 @@ class Queue:
         Raises:
             RecordingError: One is damaged, or cannot be read.
         """
-        files = sorted(self.folder.glob("*.json")) if self.folder.is_dir() else []
-        entries = [_read(file) for file in files if _NUMBER.fullmatch(file.name)]
-        existing = (entry for entry in entries if entry is not None)
-        return sorted(existing, key=lambda entry: (entry.position, entry.id))
+        return sorted(_read_all(self.folder), key=lambda entry: (entry.position, entry.id))
 
-    def add(self, sequence: Path, text: str, options: Options) -> Entry:
+    def add(
+        self,
+        sequence: Path,
+        text: str,
+        options: Options,
+        rules: Rules = Rules(),
+        expected_s: float | None = None,
+    ) -> Entry:
         """Add a sequence at the end, with the text that will run.
 
         Raises:
             RecordingError: The queue cannot be written to.
         """
         last = max((entry.position for entry in self.entries()), default=Fraction(0))
-        entry = Entry(self._new_id(), last + 1, now_utc(), sequence, text, options)
+        entry = Entry(
+            self._new_id(), last + 1, now_utc(), sequence, text, options, rules=rules, expected_s=expected_s
+        )
         self.write(entry)
         return entry
+
+    def done(self, within: timedelta) -> list[Entry]:
+        """The entries whose runs became complete within a time before now, in the order of their ends.
+
+        Raises:
+            RecordingError: One is damaged, or cannot be read.
+        """
+        first = now() - within
+        entries = _read_all(self.folder / DONE_FOLDER)
+        ended = [entry for entry in entries if datetime.fromisoformat(entry.ended_utc) >= first]
+        return sorted(ended, key=lambda entry: entry.ended_utc)
+
+    def complete(self, entry: Entry) -> None:
+        """Take an entry out of the queue whose run is complete, and keep it for the list.
+
+        Raises:
+            RecordingError: The queue cannot be written to.
+        """
+        done = replace(entry, status="complete", error="", owner=None, ended_utc=entry.ended_utc or now_utc())
+        self._write(self.folder / DONE_FOLDER, done)
+        self.drop(entry.id)
+
+    def wait_again(self, number: int) -> None:
+        """Let an entry wait again that was stopped, failed or was skipped; its run will be resumed.
+
+        Raises:
+            ConfigError: There is no such entry, or it waits, runs or is complete.
+        """
+        entry = self._find(number)
+        if entry.state not in {"stopped", "failed", "skipped"}:
+            expected = "an entry that was stopped, failed or was skipped"
+            raise ConfigError(Problem(f"entry {number} is {entry.state}", expected=expected))
+        rules = replace(entry.rules, until_utc="") if entry.rules.is_too_late else entry.rules
+        self.write(replace(entry, status="waiting", error="", n_failures=0, rules=rules))
 
     def write(self, entry: Entry) -> None:
         """Write an entry to its file.
@@ -135,8 +210,13 @@ class Queue:
         Raises:
             RecordingError: The disk is full, or the queue cannot be written to.
         """
+        self._write(self.folder, entry)
+
+    def _write(self, folder: Path, entry: Entry) -> None:
         values = {"format": FORMAT, **_adapter().dump_python(entry, mode="json")}
-        write_file(self._file(entry.id), dumps(values, indent=1).encode() + b"\n")
+        with explained(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        write_file(folder / f"{entry.id:04d}.json", dumps(values, indent=1).encode() + b"\n")
 
     def remove(self, ids: Sequence[int]) -> None:
         """Take entries out of the queue; their runs stay.
@@ -254,6 +334,13 @@ class Queue:
                 return number
 
 
+def _read_all(folder: Path) -> list[Entry]:
+    """The entries in a folder, by their numbers."""
+    files = sorted(folder.glob("*.json")) if folder.is_dir() else []
+    entries = [_read(file) for file in files if _NUMBER.fullmatch(file.name)]
+    return [entry for entry in entries if entry is not None]
+
+
 def _read(file: Path) -> Entry | None:
     """Read an entry; None if it has just been removed.
 
@@ -288,7 +375,9 @@ def _check(entry: Entry, file: Path) -> None:
     Raises:
         ValueError: It is not as :meth:`Queue.add` writes it.
     """
-    datetime.fromisoformat(entry.added_utc)
+    for time in (entry.added_utc, entry.begun_utc, entry.ended_utc, entry.rules.until_utc):
+        if time and datetime.fromisoformat(time).tzinfo is None:
+            raise ValueError(f"{time}: expected a time with its zone")
     if file.name != f"{entry.id:04d}.json":
         raise ValueError("id: expected the number in the name of the file")
     if len(entry.text) > MAX_BYTES:

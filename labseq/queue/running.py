@@ -8,25 +8,32 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
 from labseq.assembly.assemble import assemble
-from labseq.assembly.options import Options
+from labseq.assembly.calibrations import open_store
+from labseq.assembly.options import DryRun, Options
+from labseq.config.document import Document
 from labseq.config.find import find_profile
 from labseq.console.errors import exit_code_of, report, warning_lines
 from labseq.console.output import say
-from labseq.console.report import Column, print_report, table
-from labseq.console.text import plural
+from labseq.console.text import clock_time, plural
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
 from labseq.files import data_root, explained
-from labseq.messages import MAX_ERROR, clean, visible
+from labseq.messages import clean, did_you_mean, listing
+from labseq.model import CALIBRATION_KINDS
+from labseq.plain import now, now_utc
 from labseq.processes import Process
-from labseq.queue.queue import Entry, Queue
+from labseq.queue.listing import local_time, outcome_lines
+from labseq.queue.queue import Entry, EntryStatus, IfFails, Queue, Rules
 from labseq.roles import RunObserver
 from labseq.session.check import CheckReport, check
+from labseq.session.notices import Notices
 from labseq.session.session import Session
+from labseq.session.stopping import ask_to_stop
+from labseq.units import parse_quantity
 
 POLL_S: Final = 0.5
 """Time between two looks for new entries while the queue waits, in seconds."""
@@ -35,7 +42,12 @@ Opening = Callable[[RunObserver | None], Session]
 """Opens a session whose events go to an observer."""
 
 
-def add_checked(queue: Queue, sequence: Path, options: Options) -> tuple[Entry, CheckReport]:
+def add_checked(
+    queue: Queue,
+    sequence: Path,
+    options: Options,
+    rules: Rules = Rules(),  # noqa: B008 - it is immutable
+) -> tuple[Entry, CheckReport]:
     """Check a sequence as ``labseq check`` does, and add it at the end of the queue.
 
     Raises:
@@ -45,11 +57,56 @@ def add_checked(queue: Queue, sequence: Path, options: Options) -> tuple[Entry, 
     with Session.open(sequence, **asdict(options)) as session:
         document = session.assembly.document
         report, text, path = check(session), document.text, document.path.absolute()
+        # virtual time passes as fast as the computer can
+        is_timed = options.realtime or not session.assembly.virtual_time
     # absolute, as `labseq queue run` may be started in another folder
     profile = None if options.profile is None else str(find_profile(options.profile, Path()).absolute())
     output = None if options.output is None else options.output.absolute()
     options = replace(options, profile=profile, output=output, overrides=tuple(options.overrides))
-    return queue.add(path, text, options), report
+    return queue.add(path, text, options, rules, sum(report.run_s) / 2 if is_timed else None), report
+
+
+def rules_from(if_fails: IfFails, until: str | None, needs: Sequence[str]) -> Rules:
+    """The rules of an entry, from what was typed.
+
+    Args:
+        if_fails: See :class:`Rules`.
+        until: A time of day by this computer's clock, or a date and a time.
+        needs: "KIND=AGE" for each calibration, such as "thresholds=2h".
+
+    Raises:
+        ConfigError: One cannot be read.
+    """
+    return Rules(if_fails, "" if until is None else _time_utc(until), dict(map(_need, needs)))
+
+
+def _time_utc(until: str) -> str:
+    expected = "a time such as 06:00, or a date and a time such as '2026-11-30 06:00'"
+    here = now().astimezone()
+    try:
+        if len(until) <= len("06:00"):
+            at = datetime.combine(here, datetime.strptime(until, "%H:%M").time()).astimezone()
+            at += timedelta(days=at <= here)
+        else:
+            at = datetime.fromisoformat(until).astimezone()
+    except ValueError:
+        raise ConfigError(Problem(f"--until is '{clean(until)}'", expected=expected)) from None
+    if at <= here:
+        raise ConfigError(Problem(f"--until is '{clean(until)}', which is over", expected=expected))
+    return at.astimezone(UTC).isoformat(timespec="seconds")
+
+
+def _need(text: str) -> tuple[str, float]:
+    kind, equals, age = text.partition("=")
+    if kind not in CALIBRATION_KINDS or not equals:
+        hint = did_you_mean(kind, CALIBRATION_KINDS)
+        expected = f"KIND=AGE with one of {listing(CALIBRATION_KINDS)}, such as thresholds=2h"
+        raise ConfigError(Problem(f"--needs is '{clean(text)}'", expected=expected, hint=hint))
+    try:
+        return kind, parse_quantity(age, "time")
+    except ValueError:
+        expected = "an age with its unit, such as 2h or 30min"
+        raise ConfigError(Problem(f"--needs {kind} is '{clean(age)}'", expected=expected)) from None
 
 
 @dataclass(slots=True)
@@ -61,16 +118,20 @@ class QueueRun:
         take: Runs the session that its argument opens, and shows it.
         begin: Called with each entry that is taken.
         fail: Called with each error after which the queue continues.
-        keep_going: Whether the queue continues after an entry that failed.
+        calibrate: Takes a calibration: its kind, the profile, and the kind of dry run.
+        keep_going: Whether the queue continues after an entry that failed, whatever its own rule.
         first_error: The error of the first entry that failed.
+        doubted: Kinds of calibration that an alarm of an earlier run speaks against.
     """
 
     queue: Queue
     take: Callable[[Opening], None]
     begin: Callable[[Entry], None]
     fail: Callable[[LabseqError], object]
+    calibrate: Callable[[str, str, DryRun], None]
     keep_going: bool = False
     first_error: LabseqError | None = None
+    doubted: set[str] = field(default_factory=set[str])
     _tried: set[int] = field(default_factory=set[int])
 
     def run(self, *, watch: bool = False) -> None:
@@ -106,11 +167,14 @@ class QueueRun:
             lock.release()
 
     def _next(self) -> Entry | None:
-        """The entry to take; entries whose runs are complete leave the queue."""
+        """The entry to take; those whose runs are complete, or whose time is over, are not taken."""
         open_entries: list[Entry] = []
         for entry in self.queue.entries():
             if entry.is_complete:
-                self.queue.drop(entry.id)
+                self.queue.complete(entry)
+            elif entry.status == "waiting" and entry.rules.is_too_late:
+                late = f"not begun by {local_time(entry.rules.until_utc)}"
+                self.queue.write(replace(entry, status="skipped", error=late, ended_utc=now_utc()))
             elif entry.id not in self._tried:
                 open_entries.append(entry)
         interrupted = [entry for entry in open_entries if entry.is_interrupted]
@@ -119,39 +183,71 @@ class QueueRun:
         return next(iter([*interrupted, *waiting]), None)
 
     def _work(self, entry: Entry) -> None:
-        # an entry that fails is not taken again by this process
+        # an entry that fails is not taken again by this process, unless it says so
         self._tried.add(entry.id)
         self.begin(entry)
-        recorder = _EntryRecorder(
-            self.queue, replace(entry, status="running", owner=Process.current(), error="")
-        )
+        owner, begun_utc = Process.current(), now_utc()
+        begun = replace(entry, status="running", owner=owner, error="", begun_utc=begun_utc, ended_utc="")
+        recorder = _EntryRecorder(self.queue, begun, self.doubted)
         recorder.write()
         try:
+            self._take_calibrations(entry)
             self.take(lambda observer: _open(entry, recorder.passing_to(observer)))
         except StopRequested as stop:
             if stop.after_shot or stop.signal_number == signal.SIGINT:
-                recorder.end("stopped", str(stop))
+                recorder.end("stopped", recorder.why_stopped or str(stop))
             if not stop.after_shot:  # after SIGTERM the entry is interrupted, and will be resumed
                 raise
         except KeyboardInterrupt:
             recorder.end("stopped", "stopped by Ctrl-C")
             raise
         except LabseqError as error:
-            recorder.end("failed", str(error))
-            self.first_error = self.first_error or error
-            if not self.keep_going:
-                raise
-            self.fail(error)
+            self._failed(entry, recorder, error)
         else:
-            self.queue.drop(entry.id)
+            self.queue.complete(recorder.entry)
+
+    def _failed(self, entry: Entry, recorder: _EntryRecorder, error: LabseqError) -> None:
+        """Do what the entry says for a run that has failed."""
+        self.first_error = self.first_error or error
+        # a mistake in a file is there the second time, too
+        is_tried_again = entry.rules.if_fails == "retry" and entry.n_failures == 0
+        if is_tried_again and not isinstance(error, ConfigError):
+            self._tried.discard(entry.id)
+            recorder.end("waiting", str(error))
+        else:
+            recorder.end("failed", str(error))
+            if entry.rules.if_fails == "stop" and not self.keep_going:
+                raise error
+        self.fail(error)
+
+    def _take_calibrations(self, entry: Entry) -> None:
+        """Take the calibrations again that the entry needs and that are missing, too old or doubted."""
+        if not entry.rules.needs or entry.run_dir is not None:  # a resumed run keeps its calibrations
+            return
+        named = entry.options.profile or Document.read(entry.sequence, entry.stored_text).get(("profile",))
+        profile = str(find_profile(str(named), entry.sequence.parent))
+        for kind, max_age_s in entry.rules.needs.items():
+            stored = open_store(profile, entry.options.dry_run)[0].entry_in_use(kind)
+            taken = None if stored is None else datetime.fromisoformat(stored.entry.taken_utc)
+            is_new = taken is not None and (now() - taken).total_seconds() <= max_age_s
+            if not is_new or kind in self.doubted:
+                self.calibrate(kind, profile, entry.options.dry_run)
+                self.doubted.discard(kind)
 
 
 class _EntryRecorder:
-    """Implements ``RunObserver``: keeps the file of the entry that is being taken up to date."""
+    """Implements ``RunObserver``: keeps the file of the entry that is being taken up to date.
 
-    def __init__(self, queue: Queue, entry: Entry) -> None:
+    Attributes:
+        entry: The entry as its file has it.
+        why_stopped: Why its run was asked to end; "" if it was not, or by somebody else.
+    """
+
+    def __init__(self, queue: Queue, entry: Entry, doubted: set[str]) -> None:
         self._queue = queue
-        self._entry = entry
+        self.entry = entry
+        self.why_stopped = ""
+        self._doubted = doubted
         self._observer: RunObserver | None = None
 
     def passing_to(self, observer: RunObserver | None) -> _EntryRecorder:
@@ -160,23 +256,30 @@ class _EntryRecorder:
         return self
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Record the run's folder as soon as there is one."""
+        """Record the run's folder as soon as there is one; end a run whose time is over."""
         if name == "run_starting":
-            self._entry = replace(self._entry, run_dir=Path(values["run_dir"]))
+            self.entry = replace(self.entry, run_dir=Path(values["run_dir"]))
             with suppress(RecordingError):  # the run itself reports a full disk
                 self.write()
+        elif name == "warning" and values.get("alarm") == "confidence":
+            self._doubted.add("thresholds")
+        elif name == "shot_finished" and self.entry.rules.is_too_late and self.entry.run_dir is not None:
+            self.why_stopped = f"ended at {local_time(self.entry.rules.until_utc)}"
+            ask_to_stop(self.entry.run_dir)
         if self._observer is not None:
             self._observer.event(name, values)
 
     def write(self) -> None:
         """Write the entry."""
-        self._queue.write(self._entry)
+        self._queue.write(self.entry)
 
-    def end(self, status: Any, error: str) -> None:
+    def end(self, status: EntryStatus, error: str) -> None:
         """Record how it ended; an entry without a run keeps waiting."""
-        if self._entry.run_dir is None:
-            status = "waiting"
-        self._entry = replace(self._entry, status=status, error=error, owner=None)
+        status = "waiting" if self.entry.run_dir is None else status
+        n_failures = self.entry.n_failures + (status != "stopped")
+        self.entry = replace(
+            self.entry, status=status, error=error, owner=None, n_failures=n_failures, ended_utc=now_utc()
+        )
         with suppress(RecordingError):
             self.write()
 
@@ -189,106 +292,13 @@ def _open(entry: Entry, observer: RunObserver) -> Session:
     return Session(assemble(entry.sequence, options, kept=entry.stored_text), options, observer)
 
 
-def add_entry(sequence: Path, options: Options) -> None:
+def add_entry(sequence: Path, options: Options, rules: Rules) -> None:
     """Check a sequence and add it to the queue."""
-    entry, report = add_checked(Queue(data_root()), sequence, options)
+    entry, report = add_checked(Queue(data_root()), sequence, options, rules)
     for warning in report.warnings:
         say(*warning_lines(warning), stream=sys.stderr)
-    say(f"{entry.id}: {clean(str(sequence))}, {plural(report.n_shots, 'shot')}, with its present text")
-
-
-@dataclass(frozen=True, slots=True)
-class EntryRow:
-    """An entry of the queue.
-
-    Attributes:
-        changed: Whether its sequence was changed or removed since; the queued text will run.
-    """
-
-    id: int
-    state: str
-    sequence: Path
-    changed: bool
-    added_utc: str
-    options: Options
-    run_dir: Path | None
-    error: str | None
-
-    @classmethod
-    def of(cls, entry: Entry) -> EntryRow:
-        """An entry as the queue's file has it."""
-        return cls(
-            id=entry.id,
-            state=entry.state,
-            sequence=entry.sequence,
-            changed=entry.has_changed,
-            added_utc=entry.added_utc,
-            options=entry.options,
-            run_dir=entry.run_dir,
-            error=entry.error or None,
-        )
-
-    @property
-    def added_text(self) -> str:
-        """When it was added, by this computer's clock."""
-        return f"{datetime.fromisoformat(self.added_utc).astimezone():%Y-%m-%d %H:%M}"
-
-    @property
-    def options_text(self) -> str:
-        """The options that differ from their defaults."""
-        return clean(", ".join(f"{address}={value}" for address, value in self.options.changes().items()))
-
-    @property
-    def notes(self) -> list[str]:
-        """Notes for the user, for example why its run ended."""
-        notes: list[str] = []
-        if self.changed and self.state != "complete":
-            name = clean(_short(self.sequence))
-            notes.append(f"{name} was changed or removed since; the queued text will run")
-        if self.error:
-            notes.append(visible(self.error.splitlines()[0][:MAX_ERROR]))
-        if self.state in {"stopped", "failed"} and self.run_dir is not None:
-            notes.append(f"labseq resume {visible(str(self.run_dir))}")
-        return [f"{self.id}: {note}" for note in notes]
-
-
-ENTRIES: Final[Sequence[Column[EntryRow]]] = (
-    Column("id", lambda entry: entry.id, right=True),
-    Column("state", lambda entry: entry.state),
-    Column("sequence", lambda entry: clean(_short(entry.sequence))),
-    Column("added", lambda entry: entry.added_text),
-    Column("options", lambda entry: entry.options_text),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class QueueList:
-    """The entries of the queue, in order.
-
-    Attributes:
-        run_by: The process that runs them, or None.
-        paused: Whether no further entry is started.
-    """
-
-    entries: Sequence[EntryRow]
-    run_by: str | None
-    paused: bool
-
-    def as_text(self) -> list[str]:
-        """A row per entry, notes on some of them, and the state of the queue."""
-        lines = table(self.entries, ENTRIES) if self.entries else ["the queue is empty"]
-        notes = [note for entry in self.entries for note in entry.notes]
-        state = [] if self.run_by is None else [f"run by: {self.run_by}"]
-        state += ["paused: 'labseq queue pause --off' continues it"] if self.paused else []
-        return [*lines, *([""] if notes else []), *notes, *([""] if state else []), *state]
-
-
-def list_entries(*, as_json: bool) -> None:
-    """Print the entries of the queue, in order."""
-    queue = Queue(data_root())
-    entries, holder = [EntryRow.of(entry) for entry in queue.entries()], queue.holder()
-    run_by = None if holder is None else str(holder)
-    print_report(QueueList(entries, run_by, queue.is_paused), as_json=as_json)
+    takes = "" if entry.expected_s is None else f", about {clock_time(entry.expected_s)}"
+    say(f"{entry.id}: {clean(str(sequence))}, {plural(report.n_shots, 'shot')}{takes}, with its present text")
 
 
 def pause_queue(is_paused: bool) -> None:
@@ -298,25 +308,34 @@ def pause_queue(is_paused: bool) -> None:
     say(paused_text if is_paused else "the queue continues")
 
 
-def run_entries(run_session: Callable[[Opening], None], *, keep_going: bool, watch: bool) -> int:
-    """Run the entries of the queue.
+def run_entries(
+    run_session: Callable[[Opening], None],
+    calibrate: Callable[[str, str, DryRun], None],
+    *,
+    keep_going: bool,
+    watch: bool,
+) -> int:
+    """Run the entries of the queue, and say at the end what became of them.
 
     Args:
         run_session: Runs the session that its argument opens, and prints the result.
+        calibrate: Takes a calibration, and prints the result.
 
     Returns:
         The exit code: that of the first entry that failed, or 0.
     """
-    runs = QueueRun(Queue(data_root()), run_session, _report, report, keep_going=keep_going)
-    runs.run(watch=watch)
+    queue, begun = Queue(data_root()), now()
+    notices = Notices.read()
+    runs = QueueRun(queue, run_session, _report, report, calibrate, keep_going=keep_going)
+    try:
+        runs.run(watch=watch)
+    finally:
+        lines = outcome_lines(queue, now() - begun)
+        say(*lines)
+        notices.send("queue", "; ".join(lines))
     return 0 if runs.first_error is None else exit_code_of(runs.first_error)
 
 
 def _report(entry: Entry) -> None:
     resumed_run = f", resuming {entry.run_dir}" if entry.run_dir is not None else ""
     say(f"queue: {entry.id} {clean(str(entry.sequence))}{resumed_run}")
-
-
-def _short(path: Path) -> str:
-    """The path relative to the current folder if it is below it."""
-    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

@@ -34,7 +34,7 @@ class Alarms:
 
     Args:
         settings: The limits; None for no alarms.
-        warn: Receives the message when an alarm begins.
+        warn: Receives its name and a message when an alarm begins.
         wall_s: The computer's clock, which a user or a network may set.
         monotonic_s: A clock that nobody sets, and that stands still while the computer sleeps.
     """
@@ -42,7 +42,7 @@ class Alarms:
     def __init__(
         self,
         settings: AlarmSettings | None,
-        warn: Callable[[str], None],
+        warn: Callable[[str, str], None],
         wall_s: Callable[[], float] = time.time,
         monotonic_s: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -65,7 +65,7 @@ class Alarms:
         self._texts = found
         for name, text in found.items():
             if self._in_a_row[name] == 1:
-                self._warn(f"shot {shot.shot_index}: alarm '{name}': {text}")
+                self._warn(name, f"shot {shot.shot_index}: alarm '{name}': {text}")
 
     def raise_if_lasting(self) -> None:
         """End the run if an alarm has lasted too long.

@@ -31,7 +31,7 @@ class Observers:
 
     def __init__(self, host: PluginHost, observer: RunObserver | None) -> None:
         self._host = host
-        self._observer = observer
+        self._receivers = [] if observer is None else [observer]
         self._guard = Guard()
         self._hung: set[str] = set()
         self._log: Callable[..., None] | None = None
@@ -41,6 +41,10 @@ class Observers:
         self._write(name, values)
         self._notify(name, values)
         self._show(name, values)
+
+    def add(self, receiver: RunObserver) -> None:
+        """Add a receiver of every event."""
+        self._receivers.append(receiver)
 
     @contextmanager
     def logged_by(self, log: Callable[..., None]) -> Generator[None]:
@@ -73,13 +77,13 @@ class Observers:
                 self._show("warning", warning)
 
     def _show(self, name: str, values: Mapping[str, Any]) -> None:
-        if self._observer is None:
-            return
-        try:
-            self._observer.event(name, values)
-        except BaseException as error:  # noqa: BLE001 - a broken screen must not stop the run
-            self._observer = None
-            self._write("warning", {"text": f"the live view failed and is off: {format_error(error)}"})
+        for receiver in [*self._receivers]:
+            try:
+                receiver.event(name, values)
+            except BaseException as error:  # noqa: BLE001 - a broken screen must not stop the run
+                self._receivers.remove(receiver)
+                which = f"{type(receiver).__name__} failed and is off"
+                self._write("warning", {"text": f"{which}: {format_error(error)}"})
 
     def _write(self, name: str, values: Mapping[str, Any]) -> None:
         if self._log is None or name in _QUIET:

@@ -21,7 +21,7 @@ from labseq.messages import error_text, visible
 from labseq.model import RunRecord, ShotRecord
 from labseq.realtime import real_time
 from labseq.recording import RunWriter, clear_active, data_root, find_dead_run, mark_active
-from labseq.recording.folders import later_day
+from labseq.recording.folders import NOTIFY_FILE, later_day
 from labseq.recording.index import IndexRow
 from labseq.roles import RunObserver
 from labseq.safety.locks import lock_devices
@@ -74,7 +74,7 @@ class Shots:
         self._writer = writer
         assembly = run.assembly
         limits = assembly.hardware.profile.alarms if assembly.sequence.alarms else None
-        self._alarms = Alarms(limits, run.warn)
+        self._alarms = Alarms(limits, self._warn_of)
         self.sequencer = Sequencer(
             lab,
             first.steps,
@@ -86,6 +86,9 @@ class Shots:
             parameters=self._parameters(first),
             watchdog=watchdog,
         )
+
+    def _warn_of(self, alarm: str, text: str) -> None:
+        self._run.observers.event("warning", {"text": text, "alarm": alarm})
 
     def write_shot(self, shot: ShotRecord) -> IndexRow:
         """Write a shot, and look for alarms while its frames are there."""
@@ -262,6 +265,10 @@ class Session(PreparedRun):
         """
         if self.run_dir is not None:
             raise ConfigError("a session runs once; open another for the next run")
+        if (data_root() / NOTIFY_FILE).is_file():
+            from labseq.session.notices import Notices  # loads what other runs do not need
+
+            self.observers.add(Notices.read())
         for text in () if self.earlier is None else self.earlier.warnings:
             self.warn(text)
         # before devices are opened: some vendors' libraries change the working folder

@@ -76,6 +76,8 @@ class Actions:
             Endpoint(
                 "/queue/move", self.move, method="POST", body={**number, "before": "number of another entry"}
             ),
+            Endpoint("/queue/remove", self.remove, method="POST", body=number),
+            Endpoint("/queue/resume", self.resume, method="POST", body=number),
             Endpoint("/queue/pause", self.pause, method="POST", body={"paused": "true or false"}),
         ]
 
@@ -147,6 +149,18 @@ class Actions:
         values = await body_of(request)
         Queue(self._runs.root).move(_whole_number(values, "entry"), _whole_number(values, "before"))
         return {"done": "moved"}
+
+    async def remove(self, request: Request) -> Any:
+        """Take an entry out of the queue; the data of its run stay."""
+        number = _whole_number(await body_of(request), "entry")
+        Queue(self._runs.root).remove([number])
+        return {"done": f"entry {number} is removed"}
+
+    async def resume(self, request: Request) -> Any:
+        """Let an entry wait again that was stopped, failed or was skipped; the queue then resumes its run."""
+        number = _whole_number(await body_of(request), "entry")
+        Queue(self._runs.root).wait_again(number)
+        return {"done": f"entry {number} waits again"}
 
     async def pause(self, request: Request) -> Any:
         """Let the queue start no further entry until it is resumed; a run in progress continues."""

@@ -13,7 +13,8 @@ from labseq.assembly.calibrations import DRY_RUN_FOLDER, FOLDER
 from labseq.calibration_store import DECIDING, Damaged, Store, Stored, figure_of
 from labseq.errors import ConfigError, LabseqError, RecordingError
 from labseq.files import PROFILES, packaged_profiles_dir, profile_dir, read_file
-from labseq.queue.queue import Entry, Queue
+from labseq.queue.listing import NIGHT, EntryRow, expected_ends, rule_texts
+from labseq.queue.queue import Queue
 from labseq.web.runs import Catalogue, run_id, text_of
 from labseq.web.series import finite
 
@@ -31,23 +32,28 @@ def queue_values(root: Path) -> dict[str, Any]:
         "entries": [],
     }
     try:
-        values["entries"] = [_entry(entry) for entry in queue.entries()[:500]]
+        entries = queue.entries()[:500]
+        expected = expected_ends(entries)
+        values["entries"] = [_entry(EntryRow.of(entry, expected)) for entry in [*queue.done(NIGHT), *entries]]
     except RecordingError as error:
         values["error"] = text_of(error)
     return values
 
 
-def _entry(entry: Entry) -> dict[str, Any]:
+def _entry(row: EntryRow) -> dict[str, Any]:
     return {
-        "id": entry.id,
-        "state": entry.state,
-        "sequence": text_of(entry.sequence.stem, 200),
-        "path": text_of(entry.sequence, 400),
-        "changed": entry.has_changed,
-        "added_utc": text_of(entry.added_utc, 40),
-        "options": {text_of(k, 200): text_of(v, 200) for k, v in entry.options.changes().items()},
-        "run": None if entry.run_dir is None else text_of(run_id(entry.run_dir), 300),
-        "error": text_of(entry.error),
+        "id": row.id,
+        "state": row.state,
+        "sequence": text_of(row.sequence.stem, 200),
+        "path": text_of(row.sequence, 400),
+        "changed": row.changed,
+        "added_utc": text_of(row.added_utc, 40),
+        "begun_utc": row.begun_utc,
+        "ends_utc": row.ends_utc,
+        "options": {text_of(k, 200): text_of(v, 200) for k, v in row.options.changes().items()},
+        "rules": [text_of(text, 200) for text in rule_texts(row.rules)],
+        "run": None if row.run_dir is None else text_of(run_id(row.run_dir), 300),
+        "error": text_of(row.error or ""),
     }
 
 

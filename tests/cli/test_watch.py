@@ -127,3 +127,28 @@ def test_lines_of_another_version_and_damaged_ones_are_passed_over(watched: Writ
         "x\n" + "".join(f"{json.dumps(line)}\n" for line in odd) + path.read_text("utf-8"), "utf-8"
     )
     assert any(line.startswith("shot 0  ") for line in watched.watch())
+
+
+def test_the_next_run_is_watched_when_one_is_over(
+    watched: WrittenRun, tmp_path: Path, fake: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LABSEQ_DATA", str(tmp_path))
+    runs = [watched]
+
+    def begin_another() -> None:
+        runs.append(WrittenRun(tmp_path, fake))
+
+    def leave() -> None:
+        raise KeyboardInterrupt
+
+    steps: list[Callable[[], None]] = [
+        lambda: watched.writer.finish("complete"),
+        begin_another,
+        lambda: runs[1].writer.finish("failed", "no light"),
+        leave,
+    ]
+    watch_run(watched.writer.run_dir, watched.out, lambda _: steps.pop(0)(), follow=True)
+    text = watched.out.getvalue()
+    assert all(str(run.writer.run_dir) in text for run in runs)
+    assert "no light" in text
+    assert text.splitlines()[-1].startswith("no longer watched")

@@ -9,7 +9,7 @@ import pytest
 
 from labseq.assembly.options import Options
 from labseq.errors import LabseqError
-from labseq.queue.queue import Entry, Queue
+from labseq.queue.queue import Entry, Queue, Rules
 from labseq.queue.running import Opening, QueueRun, add_checked
 
 SEQUENCE = """
@@ -45,8 +45,8 @@ def queue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Queue:
     return Queue(Path("data"))
 
 
-def add(queue: Queue, sequence: str = "s.yaml", **options: object) -> Entry:
-    return add_checked(queue, Path(sequence), Options(**options))[0]  # pyright: ignore[reportArgumentType]
+def add(queue: Queue, sequence: str = "s.yaml", rules: Rules | None = None, **options: object) -> Entry:
+    return add_checked(queue, Path(sequence), Options(**options), rules or Rules())[0]  # pyright: ignore[reportArgumentType]
 
 
 class Taking:
@@ -56,6 +56,7 @@ class Taking:
         self.runs: list[Path] = []
         self.failures: list[LabseqError] = []
         self.begun: list[int] = []
+        self.calibrated: list[tuple[str, str]] = []
         self._acts = dict(enumerate(acts))
 
     def __call__(self, opening: Opening) -> None:
@@ -74,12 +75,16 @@ class Taking:
                 if session.run_dir is not None:
                     self.runs.append(session.run_dir)
 
+    def calibrate(self, kind: str, profile: str, dry_run: str) -> None:
+        self.calibrated.append((kind, Path(profile).name))
+
     def run(self, queue: Queue, *, keep_going: bool = False) -> QueueRun:
         runs = QueueRun(
             queue,
             self,
             lambda entry: self.begun.append(entry.id),
             self.failures.append,
+            self.calibrate,
             keep_going=keep_going,
         )
         runs.run()

@@ -5,15 +5,20 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from labseq.assembly.calibrations import open_store
 from labseq.data import open_run
 from labseq.errors import ConfigError, RecordingError, StopRequested
+from labseq.model import CalibrationEntry, SiteGrid, grid_facts
+from labseq.plain import now_utc
 from labseq.processes import Process
-from labseq.queue.queue import Queue
+from labseq.queue.queue import Queue, Rules
 from labseq.queue.running import Opening, QueueRun
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop
@@ -31,6 +36,9 @@ def test_entries_are_run_in_order_and_leave_the_queue(queue: Queue) -> None:
     assert taking.begun == [first.id, second.id]
     assert [len(open_run(run).shots) for run in taking.runs] == [3, 1]
     assert queue.entries() == []
+    done = queue.done(timedelta(hours=1))
+    assert [(entry.id, entry.run_dir) for entry in done] == [(1, taking.runs[0]), (2, taking.runs[1])]
+    assert queue.done(timedelta(0)) == []
     assert add(queue).id == 3  # no number comes again
 
 
@@ -162,7 +170,7 @@ def test_ctrl_c_is_meant_and_a_computer_that_shuts_down_is_not(
 
     session: Any = None
     with pytest.raises(StopRequested):
-        QueueRun(queue, take, lambda _: None, lambda _: None).run()
+        QueueRun(queue, take, lambda _: None, lambda _: None, Taking().calibrate).run()
     first, second = queue.entries()
     assert (first.status, second.status) == (status, "waiting")
     assert first.run_dir == session.run_dir
@@ -198,3 +206,104 @@ def test_an_entry_of_a_living_process_is_left_alone(queue: Queue) -> None:
     assert states(queue) == {1: "running"}
     with pytest.raises(ConfigError, match="entry 1 is running; 'labseq stop' ends it first"):
         queue.remove([1])
+
+
+def lose_folder(run_dir: Path) -> None:
+    shutil.rmtree(run_dir / "shots")
+
+
+def mend_folder(run_dir: Path) -> None:
+    (run_dir / "shots").mkdir(exist_ok=True)
+
+
+def test_each_entry_says_what_its_failure_means(queue: Queue) -> None:
+    add(queue, rules=Rules("skip"))
+    add(queue)
+    taking = Taking(lose_folder)
+    assert isinstance(taking.run(queue).first_error, RecordingError)
+    assert (taking.begun, [type(error) for error in taking.failures]) == ([1, 2], [RecordingError])
+    assert states(queue) == {1: "failed"}
+
+
+def test_a_run_that_fails_is_resumed_once_if_its_entry_says_so(queue: Queue) -> None:
+    add(queue, rules=Rules("retry"))
+    add(queue)
+    tried: list[Path] = []
+
+    class Losing:
+        def event(self, name: str, values: Mapping[str, Any]) -> None:
+            if name == "shot_finished" and len(tried) == 1:
+                lose_folder(tried[0])
+            elif name == "run_starting":
+                tried.append(Path(values["run_dir"]))
+                mend_folder(tried[-1])
+
+    def take(opening: Opening) -> None:
+        if tried:
+            mend_folder(tried[0])
+        with opening(Losing()) as session:
+            session.run()
+
+    failures: list[Exception] = []
+    QueueRun(queue, take, lambda _: None, failures.append, Taking().calibrate).run()
+    assert len(failures) == 1
+    assert tried[0] == tried[1] != tried[2]
+    assert open_run(tried[0]).status == "complete"
+    assert queue.entries() == []
+
+
+def test_a_run_that_fails_twice_is_left_and_the_queue_goes_on(queue: Queue) -> None:
+    add(queue, rules=Rules("retry"))
+    add(queue)
+    taking = Taking(lose_folder)  # and there is none when the run is resumed
+    taking.run(queue)
+    assert taking.begun == [1, 1, 2]
+    assert states(queue) == {1: "failed"}
+
+
+def test_no_shot_is_taken_after_the_time_of_an_entry(queue: Queue) -> None:
+    over = now_utc()
+    add(queue, rules=Rules(until_utc=over))
+    add(queue)
+    taking = Taking()
+    taking.run(queue)
+    assert taking.begun == [2]
+    (skipped,) = queue.entries()
+    assert (skipped.state, skipped.error[:12]) == ("skipped", "not begun by")
+    queue.wait_again(1)
+    Taking().run(queue)
+    assert queue.entries() == []
+
+
+def test_a_run_whose_time_is_over_ends_after_its_shot(queue: Queue, monkeypatch: pytest.MonkeyPatch) -> None:
+    add(queue, rules=Rules(until_utc="2100-01-01T00:00:00+00:00"))
+    taking = Taking(lambda _: monkeypatch.setattr(Rules, "is_too_late", True))
+    taking.run(queue)
+    monkeypatch.undo()
+    assert [len(open_run(run).shots) for run in taking.runs] == [2]  # looked at before this test's own act
+    assert (states(queue), queue.entries()[0].error[:8]) == ({1: "stopped"}, "ended at")
+    queue.wait_again(1)
+    with pytest.raises(ConfigError, match="entry 1 is waiting; expected an entry that was stopped"):
+        queue.wait_again(1)
+
+
+def test_a_calibration_that_is_missing_old_or_doubted_comes_first(
+    queue: Queue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add(queue, rules=Rules(needs={"thresholds": 3600.0}))
+    taking = Taking()
+    taking.run(queue)
+    assert taking.calibrated == [("thresholds", "p.yaml")]
+    store = open_store("./p.yaml")[0]
+    values = {"thresholds": np.full((4, 4), 100.0)}
+    entry = CalibrationEntry("thresholds", values, {}, grid_facts(SiteGrid(4, 4)), {}, now_utc("seconds"))
+    store.use(store.add(entry), SiteGrid(4, 4))
+    add(queue, rules=Rules(needs={"thresholds": 3600.0}))
+    add(queue, rules=Rules(needs={"thresholds": 0.0}))
+    taking = Taking()
+    taking.run(queue)
+    assert (taking.begun, len(taking.calibrated)) == ([2, 3], 1)
+    add(queue, rules=Rules(needs={"thresholds": 3600.0}))
+    runs = QueueRun(queue, taking, lambda _: None, lambda _: None, taking.calibrate, doubted={"thresholds"})
+    runs.run()
+    assert (len(taking.calibrated), runs.doubted) == (2, set())

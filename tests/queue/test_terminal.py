@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import labseq
 from labseq.cli import main
 from labseq.errors import StopRequested
+from labseq.plain import now
 from labseq.session.stopping import ask_to_stop
 from labseq.testing.fakes import RecordingObserver
 
@@ -45,15 +47,20 @@ def test_runs_are_queued_listed_moved_removed_and_run(capsys: pytest.CaptureFixt
     code, out, err = call(capsys, "queue", "list")
     assert (code, err) == (0, "")
     header, first, second = out.splitlines()
-    assert header.split() == ["id", "state", "sequence", "added", "options"]
+    assert header.split() == ["id", "state", "sequence", "begun", "ends", "options"]
     assert (first.split()[:3], first.split()[-1]) == (["3", "waiting", "s.yaml"], "seed=7")
     assert second.endswith("shots=2, attempts=5")
     code, out, err = call(capsys, "queue", "run")
     assert (code, err) == (0, "")
-    assert [line[:8] for line in out.splitlines() if line.startswith("queue:")] == ["queue: 3", "queue: 1"]
+    about_queue = [line for line in out.splitlines() if line.startswith("queue:")]
+    assert [line[:8] for line in about_queue[:2]] == ["queue: 3", "queue: 1"]
+    assert about_queue[2:] == ["queue: 2 runs complete"]
     runs = sorted(Path("data").glob("*/*/run.json"))
     assert [len(labseq.open_run(run).shots) for run in runs] == [3, 2]
-    assert "empty" in call(capsys, "queue", "list")[1]
+    assert [row.split()[:2] for row in call(capsys, "queue", "list")[1].splitlines()[1:]] == [
+        ["3", "complete"],
+        ["1", "complete"],
+    ]
 
 
 def test_the_list_says_what_one_should_know(capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,11 +88,12 @@ def test_a_queue_that_keeps_going_ends_with_the_first_failure(
     code, out, err = call(capsys, "queue", "run", "--keep-going")
     assert code == 3
     assert err.count("error: ") == 1
-    assert out.count("queue: ") == 2
+    assert out.count("queue: ") == 4
+    assert out.endswith("queue: 1 run complete\nqueue: 1 failed: 1 s\n")
     code, out, _ = call(capsys, "queue", "list")
     (run,) = [path.parent for path in Path("data").glob("*/*/run.json") if not labseq.open_run(path).shots]
-    assert f"1: labseq resume {run.absolute()}" in out.splitlines()
-    assert out.splitlines()[1].split()[:2] == ["1", "failed"]
+    assert f"1: 'labseq resume {run.absolute()}' resumes its run now, " in out
+    assert [row.split()[:2] for row in out.splitlines()[1:3]] == [["2", "complete"], ["1", "failed"]]
 
 
 @pytest.mark.parametrize(
@@ -149,3 +157,37 @@ def test_a_run_in_progress_is_asked(stopped: Path, capsys: pytest.CaptureFixture
     assert out.splitlines()[0].startswith(f"{stopped} (process ")
     assert out.splitlines()[1].endswith(f"labseq resume {stopped}")
     assert (stopped / "STOP").exists()
+
+
+def test_rules_are_listed_with_the_expected_ends(capsys: pytest.CaptureFixture[str]) -> None:
+    rules = ("--if-fails", "skip", "--until", "2100-01-01 06:00", "--needs", "thresholds=2h")
+    for _ in range(2):
+        code, out, err = call(capsys, "queue", "add", "s.yaml", "--realtime", "--shots", "36000", *rules)
+        assert (code, err, ", about 1:" in out) == (0, "", True)
+    first, second = call(capsys, "queue", "list")[1].splitlines()[1:]
+    assert first.count(" about ") == second.count(" about ") == 1
+    assert "shots=36000, if-fails=skip, until=2100-01-01 06:00, needs" in first
+    values = json.loads(call(capsys, "queue", "list", "--json")[1])["entries"]
+    ends = [datetime.fromisoformat(one["ends_utc"]) for one in values]
+    expected_s = values[0]["expected_s"]
+    assert 3600 < expected_s < 3 * 3600
+    assert abs((ends[1] - ends[0]).total_seconds() - expected_s) < 2
+    assert abs((ends[0] - now()).total_seconds() - expected_s) < 60
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        (("--until", "6 am"), "--until is '6 am'; expected a time such as 06:00"),
+        (("--until", "2001-01-01 06:00"), "which is over"),
+        (("--needs", "threshold=2h"), "did you mean 'thresholds'?"),
+        (("--needs", "thresholds=2"), "--needs thresholds is '2'; expected an age with its unit"),
+    ],
+)
+def test_wrong_rules_are_refused(
+    capsys: pytest.CaptureFixture[str], options: tuple[str, ...], what: str
+) -> None:
+    code, _, err = call(capsys, "queue", "add", "s.yaml", *options)
+    assert code == 2
+    assert what in err
+    assert "empty" in call(capsys, "queue", "list")[1]

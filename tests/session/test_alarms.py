@@ -38,7 +38,7 @@ class Watched:
         self.warnings: list[str] = []
         self.wall_s = self.monotonic_s = 0.0
         clocks = lambda: self.wall_s, lambda: self.monotonic_s
-        self.alarms = Alarms(AlarmSettings(**settings), self.warnings.append, *clocks)
+        self.alarms = Alarms(AlarmSettings(**settings), lambda _, text: self.warnings.append(text), *clocks)
         self.n = 0
 
     def shot(self, *images: ImageRecord, status: Any = "complete") -> list[str]:

@@ -84,6 +84,16 @@ def test_entries_are_moved_and_the_queue_paused(acting: Client, run_dir: Path) -
     assert order() == [3, 1, 2]
     for wrong in ({"entry": 9, "before": 1}, {"entry": "1", "before": 2}, {}):
         assert acting.post("/api/v1/queue/move", wrong).status_code == 409
+    assert acting.post("/api/v1/queue/resume", {"entry": 3}).status_code == 409  # it waits
+    queue.write(replace(queue.entries()[0], status="failed", error="the camera is gone"))
+    assert acting.post("/api/v1/queue/resume", {"entry": 3}).status_code == 200
+    assert queue.entries()[0].status == "waiting"
+    assert acting.post("/api/v1/queue/remove", {"entry": 3}).status_code == 200
+    queue.complete(queue.entries()[0])
+    assert [(one["id"], one["state"]) for one in acting.get("/api/v1/queue").json()["entries"]] == [
+        (1, "complete"),
+        (2, "waiting"),
+    ]
     assert acting.post("/api/v1/queue/pause", {"paused": True}).status_code == 200
     assert acting.get("/api/v1/queue").json()["is_paused"]
     assert acting.post("/api/v1/queue/pause", {"paused": False}).status_code == 200
@@ -105,7 +115,9 @@ def test_a_paused_queue_waits_and_goes_on(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr("labseq.queue.running.time.sleep", wait)
     begun = list[int]()
-    QueueRun(queue, lambda opening: None, lambda one: begun.append(one.id), lambda _: None).run()
+    QueueRun(
+        queue, lambda opening: None, lambda one: begun.append(one.id), lambda _: None, lambda *_: None
+    ).run()
     assert (waited, begun) == ([True], [1])
 
 

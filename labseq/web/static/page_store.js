@@ -27,11 +27,28 @@ export async function showQueue(main) {
   return () => clearInterval(again);
 }
 
+const AHEAD = ["running", "interrupted", "waiting"], EARLY = ["stopped", "failed", "skipped"];
+
 function entries(all, act) {
-  const heads = [{ text: "id", right: true }, "state", "sequence", "added", "changed values", "run", ...(server.may_act ? ["order"] : [])];
-  return table(heads, all.map((one, i) => [String(one.id), statusPill(one.state), one.sequence, localTime(one.added_utc), Object.entries(one.options).map(([k, v]) => `${k} = ${v}`).join(", ") || "–",
-    one.run ? runLink(one.run) : "–", ...(server.may_act ? [el("span", {}, el("button.quiet", { type: "button", disabled: i === 0, "aria-label": `Move entry ${one.id} up`, onclick: () => act("/queue/move", { entry: one.id, before: all[i - 1].id }) }, "↑"),
-      el("button.quiet", { type: "button", disabled: i === all.length - 1, "aria-label": `Move entry ${one.id} down`, onclick: () => act("/queue/move", { entry: all[i + 1].id, before: one.id }) }, "↓"))] : [])]), { label: "Entries of the queue" });
+  const heads = [{ text: "id", right: true }, "state", "sequence", "begun", "ends", "changed values and rules", "run", ...(server.may_act ? ["order"] : [])];
+  return table(heads, all.map((one, i) => {
+    const changed = [...Object.entries(one.options).map(([k, v]) => `${k} = ${v}`), ...one.rules].join(", ");
+    const ends = one.ends_utc ? `${AHEAD.includes(one.state) ? "about " : ""}${localTime(one.ends_utc)}` : "–";
+    return [String(one.id), statusPill(one.state), el("span", { title: one.path }, one.sequence, one.error ? el("small.reason", {}, one.error) : null), one.begun_utc ? localTime(one.begun_utc) : "–", ends, changed || "–",
+      one.run ? runLink(one.run) : "–", ...(server.may_act ? [orderButtons(all, i, act)] : [])];
+  }), { label: "Entries of the queue" });
+}
+
+function orderButtons(all, i, act) {
+  const one = all[i];
+  if (one.state === "complete") return "";
+  const button = (text, label, path, values, disabled = false) => el("button.quiet", { type: "button", disabled, "aria-label": `${label} entry ${one.id}`, onclick: () => act(path, values) }, text);
+  const isFirst = i === 0 || all[i - 1].state === "complete";
+  return el("span", {},
+    isFirst ? null : button("↑", "Move up", "/queue/move", { entry: one.id, before: all[i - 1].id }),
+    i === all.length - 1 ? null : button("↓", "Move down", "/queue/move", { entry: all[i + 1].id, before: one.id }),
+    EARLY.includes(one.state) ? button("resume", "Resume", "/queue/resume", { entry: one.id }) : null,
+    one.state === "running" ? null : button("remove", "Remove", "/queue/remove", { entry: one.id }));
 }
 
 async function addForm(box, act) {

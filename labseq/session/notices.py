@@ -1,0 +1,127 @@
+"""Notices to people who are not in the lab: what ``notify.yaml`` in the data folder asks for.
+
+A notice is sent by a process of its own, so that neither a slow network nor a program that hangs delays a
+shot, and so that it is sent even if this process ends meanwhile.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, Self
+
+from pydantic import Field, StringConstraints
+
+from labseq.config.document import Document
+from labseq.files import data_root
+from labseq.messages import visible
+from labseq.plain import dumps
+from labseq.recording.folders import NOTIFY_FILE
+from labseq.settings import Settings
+
+NOTIFY_LOG: Final = "notify.log"
+"""Notices that could not be sent."""
+LOOK_S: Final = 60.0
+"""Time between two looks at the free space of the disk, in seconds."""
+
+NoticeKind = Literal["failed", "alarm", "disk", "queue"]
+
+
+class NoticeSettings(Settings):
+    """The file ``notify.yaml``."""
+
+    labseq: Literal[1]
+    command: tuple[str, ...] = Field(
+        default=(), description="a program and its arguments, to which the text of the notice is added"
+    )
+    webhook: Annotated[str, StringConstraints(pattern=r"^(https?://\S+)?$")] = Field(
+        default="", description="an address that receives each notice as JSON by POST"
+    )
+    on: tuple[NoticeKind, ...] = Field(
+        default=("failed", "alarm", "disk", "queue"),
+        description="a run has failed, an alarm has begun, the disk is nearly full, the queue has ended",
+    )
+    free_gb: float = Field(default=5.0, gt=0, description="'disk': fewer GB than this are free")
+
+
+class Notices:
+    """Implements ``RunObserver``: sends a notice of each event that somebody wants to know.
+
+    Args:
+        settings: Whom to send what; None to send nothing.
+        root: The data folder.
+
+    Attributes:
+        settings: The same.
+    """
+
+    def __init__(self, settings: NoticeSettings | None, root: Path) -> None:
+        self.settings = settings
+        self._root = root
+        self._run_dir = Path()
+        self._next_look_s = 0.0
+
+    @classmethod
+    def read(cls) -> Self:
+        """As the file in the data folder asks; without one, nothing is sent.
+
+        Raises:
+            ConfigError: The file has an error.
+        """
+        root = data_root().absolute()
+        path = root / NOTIFY_FILE
+        return cls(Document.read(path).validate(NoticeSettings) if path.is_file() else None, root)
+
+    def event(self, name: str, values: Mapping[str, Any]) -> None:
+        """Send a notice if the event is one that is wanted."""
+        if self.settings is None:
+            return
+        match name:
+            case "run_starting":
+                self._run_dir = Path(values["run_dir"])
+            case "warning" if "alarm" in values:
+                self.send("alarm", values["text"])
+            case "run_finished" if values["status"] == "failed":
+                self.send("failed", values["error"])
+            case "shot_finished":
+                self._look_at_disk(self.settings.free_gb)
+            case _:
+                pass
+
+    def _look_at_disk(self, free_gb: float) -> None:
+        if time.monotonic() < self._next_look_s:
+            return
+        self._next_look_s = time.monotonic() + LOOK_S
+        free = shutil.disk_usage(self._run_dir).free
+        if free < free_gb * 1e9:
+            self._next_look_s = float("inf")  # once in a run
+            self.send("disk", f"{free / 1e9:.2g} GB are free on the disk of {visible(str(self._run_dir))}")
+
+    def send(self, kind: NoticeKind, text: str) -> None:
+        """Send a notice, if its kind is wanted."""
+        settings = self.settings
+        if settings is None or kind not in settings.on:
+            return
+        run = self._run_dir.name
+        notice = {"kind": kind, "run": run, "text": f"labseq: {f'{run}: ' if run else ''}{text}"}
+        deliver(self._root, settings.command, settings.webhook, notice)
+
+
+def deliver(root: Path, command: Sequence[str], webhook: str, notice: Mapping[str, str]) -> None:
+    """Start the process that sends a notice; it is not waited for."""
+    task = {"command": [*command], "webhook": webhook, "notice": notice, "log": str(root / NOTIFY_LOG)}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "labseq.session.send_notice"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C ends the run, not the notice of it
+    )
+    assert process.stdin is not None
+    with process.stdin as pipe:
+        pipe.write(dumps(task).encode())
+    process.returncode = 0  # nobody waits for it, which Python would warn of

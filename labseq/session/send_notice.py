@@ -1,0 +1,62 @@
+"""Sends one notice, read as JSON from stdin; its own process, started by :mod:`labseq.session.notices`."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from labseq.plain import now_utc
+
+MAX_S: Final = 20.0
+"""Maximum time for the program and for the address, in seconds each."""
+
+
+def send(task: Mapping[str, Any]) -> list[str]:
+    """Send a notice by every way that is given.
+
+    Returns:
+        Why a way failed, for each one that did.
+    """
+    command, webhook, notice = task["command"], task["webhook"], task["notice"]
+    ways: list[Callable[[], object]] = []
+    if command:
+        ways.append(lambda: _run([*command, notice["text"]]))
+    if webhook:
+        ways.append(lambda: _post(webhook, notice))
+    failures: list[str] = []
+    for way in ways:
+        try:
+            way()
+        except (OSError, ValueError, subprocess.SubprocessError) as error:
+            failures.append(f"{type(error).__name__}: {error}")
+    return failures
+
+
+def _run(command: Sequence[str]) -> None:
+    subprocess.run(command, stdin=subprocess.DEVNULL, timeout=MAX_S, check=True)  # noqa: S603 - the user's own
+
+
+def _post(address: str, notice: Mapping[str, str]) -> None:
+    head = {"Content-Type": "application/json"}
+    request = urllib.request.Request(address, json.dumps(notice).encode(), head, method="POST")  # noqa: S310 - http(s), by the settings' pattern
+    with urllib.request.urlopen(request, timeout=MAX_S):  # noqa: S310
+        pass
+
+
+def main() -> None:
+    """Send the notice, and add what failed to the log."""
+    task = json.load(sys.stdin)
+    if failures := send(task):
+        with Path(task["log"]).open("a", encoding="utf-8") as log:
+            log.writelines(
+                f"{now_utc('seconds')} {task['notice']['text']}: {failure}\n" for failure in failures
+            )
+
+
+if __name__ == "__main__":
+    main()
