@@ -10,12 +10,11 @@ from typing import Final
 
 from labseq.assembly.options import Options
 from labseq.console.report import Column, print_report, table
-from labseq.console.text import plural
+from labseq.console.text import age_text, plural
 from labseq.files import data_root
 from labseq.messages import MAX_ERROR, clean, visible
 from labseq.plain import now
 from labseq.queue.queue import Entry, Queue, Rules
-from labseq.units import format_quantity
 
 NIGHT: Final = timedelta(hours=24)
 """Entries whose runs became complete within this time are listed."""
