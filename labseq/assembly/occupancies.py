@@ -5,37 +5,51 @@ from __future__ import annotations
 import re
 import secrets
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
 import numpy as np
-from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
+from labseq.array_files import ARRAY_FILES, opened_array, split_name
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, did_you_mean, shown, visible
 from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern, as_occupancy
-from labseq.text_files import YAML_SUFFIXES, decode, files_in, is_file, something_else
+from labseq.text_files import (
+    YAML_SUFFIXES,
+    decode,
+    files_in,
+    is_file,
+    line_and_column,
+    something_else,
+)
 from labseq.units import parse_quantity
 
 MAX_SITES: Final = 1000
 """Maximum number of rows and of columns, as in a hardware profile."""
-MAX_BYTES: Final = 4 << 20
-"""Maximum size of a text, in bytes."""
-MAX_NPY_BYTES: Final = 32 << 20
-"""Maximum size of a .npy file, in bytes."""
+MAX_BYTES: Final = 32 << 20
+"""Maximum size of a text, in bytes: 1000 x 1000 sites as numpy.savetxt writes them by default."""
 FORMS: Final = (
-    "a .npy file, a text file of 0 and 1, '-' for standard input, a shot file such as "
-    "shots/shot_000003.h5#2, or random:20x20@0.75"
+    "a text file of 0 and 1, a .npy file, an array such as loadings.npz:loaded#3, '-' for standard input, "
+    "a shot file such as shots/shot_000003.h5#2, or random:20x20@0.75"
 )
 
 _RANDOM: Final = re.compile(r"random:\s*(\d{1,9})\s*[xX]\s*(\d{1,9})\s*@(.+)")
-_SHOT: Final = re.compile(r"(.+\.h5)(?:#(.*))?", re.IGNORECASE)
-_LINE_BREAK: Final = re.compile(r"\r\n|\r|\n")
-_CHARACTERS: Final = {"1": True, "#": True, "0": False, ".": False}
-_SEPARATORS: Final = " \t,;"
+_ARRAY: Final = re.compile(r"(.+\.(?:npy|npz|h5|hdf5)(?::[^#]*)?)(?:#(.*))?", re.IGNORECASE)
+_SHOT: Final = re.compile(r".+\.h5", re.IGNORECASE)
+_LINE_BREAK: Final = re.compile(r"\r\n|\r|\n|$")
+_LIST_ROW: Final = re.compile(r"\[([^][]*)\]")
+_WORD: Final = re.compile(r"[^\s,;]+")
+_COMMENT: Final = re.compile(r"(?<![^\r\n])[ \t]*#[^\r\n]*(?:\r\n|\r|\n)?|#[^\r\n]*")
+"""A line with a comment and its end, or a comment behind a row."""
+_COUNTED_ROW: Final = re.compile(r"(?<![^\r\n])[][ \t,;+-]*(?:\d|true|false)", re.IGNORECASE)
+_DRAWN: Final = {"#": True, ".": False}
+_COUNTED: Final = {"1": True, "0": False}
+_SEPARATORS: Final = " \t\r\n,;"
+_SITES: Final = "0 or '.' for an empty site, 1 or '#' for an atom"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,59 +94,143 @@ def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = Non
     if text.lower().endswith(YAML_SUFFIXES):
         hint = "to plan for its target, write: labseq plan random:20x20@0.75 --target " + clean(text)
         raise ConfigError(Problem("a sequence holds no occupancy", clean(text), expected=FORMS, hint=hint))
-    match = _SHOT.fullmatch(text)
-    path = Path(match[1] if match else text)
+    match = _ARRAY.fullmatch(text)
+    address, index = match.groups() if match else (text, None)
+    path, name = split_name(address)
     if not is_file(path):
         what = something_else(path) or "there is no such file"
-        names = [name for name in files_in(path.parent, (".npy", ".txt", ".h5")) if name != path.name]
+        names = [name for name in files_in(path.parent, (".txt", *ARRAY_FILES)) if name != path.name]
         hint = did_you_mean(path.name, names)
         raise ConfigError(Problem(what, clean(str(path)), expected=FORMS, hint=hint))
-    if match:
-        return _shot(path, match[2])
-    label = visible(str(path))
-    if path.suffix.lower() == ".npy":
-        return Source(_npy(path), label)
+    if _SHOT.fullmatch(address):
+        return _shot(path, index)
+    label = visible(text)
+    if path.suffix.lower() in ARRAY_FILES:
+        return Source(_array(path, name, index, label), label)
     return Source(parse_text(_read(path), label), label)
 
 
 def parse_text(data: bytes, name: str) -> Occupancy:
-    r"""Read rows of 0 and 1 (or "." and "#"), with or without spaces or commas between them.
+    r"""Read rows of 0 and 1, or drawn with "." and "#"; or a list of rows.
+
+    Numbers may be written as numpy.savetxt and spreadsheets do (1.0, 1e+00, True), with spaces, commas,
+    tabs or semicolons between them. Beside numbers, "#" begins a comment.
 
     Args:
         data: UTF-8.
+        name: Where it comes from, for messages.
 
     Raises:
         ConfigError: With line and column.
 
     Example:
-        >>> parse_text(b"1 0 1\n#.#\n", "mine").astype(int).tolist()
-        [[1, 0, 1], [1, 0, 1]]
+        >>> parse_text(b"1 0 1\n0 1 0\n", "mine").astype(int).tolist()
+        [[1, 0, 1], [0, 1, 0]]
+        >>> parse_text(b"# a loading\n1.0,0.0\n0.0,1.0\n", "mine").astype(int).tolist()
+        [[1, 0], [0, 1]]
+        >>> parse_text(b"#.#", "mine").astype(int).tolist()
+        [[1, 0, 1]]
     """
     if len(data) > MAX_BYTES:
-        raise ConfigError(Problem("it is larger than 4 MiB", name, expected=_size_limit()))
-    lines = _LINE_BREAK.split(decode(data, name))
-    filled = [i for i, line in enumerate(lines) if line.strip(_SEPARATORS)]
-    if not filled:
+        raise ConfigError(Problem(f"it is larger than {MAX_BYTES >> 20} MiB", name, expected=_size_limit()))
+    text = _Text(decode(data, name), name)
+    rows = [(start, text.sites(start, row)) for start, row in text.rows()]
+    if not rows:
         raise ConfigError(Problem("it is empty", name, expected="rows of 0 and 1, one line each"))
-    numbered = [(i, lines[i]) for i in range(filled[0], filled[-1] + 1)]
-    rows = [_text_row(line, name, i + 1) for i, line in numbered]
-    for (i, _), row in zip(numbered, rows, strict=True):
-        if len(row) != len(rows[0]):
-            what = f"this row has {len(row)} sites"
-            expected = f"{len(rows[0])}, as in line {filled[0] + 1}"
-            columns = [n for n, character in enumerate(lines[i], start=1) if character in _CHARACTERS]
-            column = columns[len(rows[0])] if len(row) > len(rows[0]) else len(lines[i].rstrip()) + 1
-            raise ConfigError(Problem(what, name, i + 1, column, expected))
-    return _checked(np.array(rows, np.bool_), name)
+    first_line, n_cols = text.place(rows[0][0])[0], len(rows[0][1])
+    for start, sites in rows:
+        if len(sites) != n_cols:
+            what, expected = f"this row has {len(sites)} sites", f"{n_cols}, as in line {first_line}"
+            end = sites[-1][0] + 1 if sites else start
+            raise text.error(what, sites[n_cols][0] if len(sites) > n_cols else end, expected)
+    return _checked(np.array([[atom for _, atom in sites] for _, sites in rows], np.bool_), name)
 
 
-def _text_row(line: str, name: str, number: int) -> list[bool]:
-    for i, character in enumerate(line):
-        if character not in _CHARACTERS and character not in _SEPARATORS:
-            what = f"{shown(character)} is not a site"
-            expected = "0 or '.' for an empty site, 1 or '#' for an atom"
-            raise ConfigError(Problem(what, name, number, i + 1, expected))
-    return [_CHARACTERS[character] for character in line if character in _CHARACTERS]
+class _Text:
+    """A text that holds an occupancy: its rows, and the places of what is wrong in them."""
+
+    def __init__(self, text: str, name: str) -> None:
+        self._text, self._name = text, name
+        # beside numbers "#" begins a comment, as for numpy; in a drawing it is an atom
+        self._is_drawn = _COUNTED_ROW.search(text) is None
+
+    def place(self, index: int) -> tuple[int, int]:
+        """Line and column of a character."""
+        return line_and_column(self._text, index)
+
+    def error(self, what: str, index: int, expected: str, hint: str = "") -> ConfigError:
+        """An error at a character."""
+        return ConfigError(Problem(what, self._name, *self.place(index), expected, hint))
+
+    def rows(self) -> Iterator[tuple[int, str]]:
+        """The start and the text of each row, without comments and the empty lines around all rows."""
+        # comments become spaces, so that all else keeps its place
+        text = self._text if self._is_drawn else _COMMENT.sub(self._blank, self._text)
+        if "[" in text:
+            yield from self._listed(text)
+            return
+        start, begin, end = 0, len(text) - len(text.lstrip(_SEPARATORS)), len(text.rstrip(_SEPARATORS))
+        for line_break in _LINE_BREAK.finditer(text):
+            if line_break.start() > begin and start < end:
+                yield start, text[start : line_break.start()]
+            start = line_break.end()
+
+    def _blank(self, comment: re.Match[str]) -> str:
+        if re.fullmatch(r"\s*#[ \t]*[#.][#. \t]*\s*", comment[0]):
+            what, expected = "a row of '#' and '.' among rows of numbers", "one kind of rows"
+            raise self.error(what, comment.start(), expected, "begin a comment with '# ' and a word")
+        return " " * len(comment[0])
+
+    def _listed(self, text: str) -> Iterator[tuple[int, str]]:
+        """The rows of ``[[1, 0], [0, 1]]``, as Python and numpy write them; one may take several lines."""
+        between = _LIST_ROW.sub(lambda row: " " * len(row[0]), text)
+        if stray := re.search(r"[^][\s,;]", between):
+            raise self.error(f"{shown(stray[0])} is not within a row", stray.start(), "[[1, 0], [0, 1]]")
+        for row in _LIST_ROW.finditer(text):
+            yield row.start(1), row[1]
+
+    def sites(self, start: int, row: str) -> list[tuple[int, bool]]:
+        """The sites of a row: index in the text, and whether there is an atom.
+
+        Raises:
+            ConfigError: Something in it is not a site, or its values are separated in different ways.
+        """
+        words = list(_WORD.finditer(row))
+        separators = [row[a.end() : b.start()].strip() for a, b in pairwise(words)]
+        for word, separator in zip(words, separators, strict=False):
+            # "1,0 0,0" are two numbers with decimal commas, and "1,,0" lacks a value
+            if separator != separators[0] or len(separator) > 1:
+                what = f"the separator after '{clean(word[0])}' differs from the others of the row"
+                expected = "one comma, semicolon, or space after each value"
+                hint = "write numbers with a decimal point"
+                raise self.error(what, start + word.end(), expected, hint)
+        return [site for word in words for site in self._word(start + word.start(), word[0])]
+
+    def _word(self, start: int, word: str) -> list[tuple[int, bool]]:
+        """The sites of a word: one for each character of "0110" and "#..#", or one number or truth value."""
+        characters = _DRAWN if self._is_drawn else _COUNTED
+        wrong = next((i for i, character in enumerate(word) if character not in characters), None)
+        if wrong is None:
+            return [(start + i, characters[character]) for i, character in enumerate(word)]
+        value = None if self._is_drawn else _number(word)
+        if value in (0.0, 1.0):
+            return [(start, bool(value))]
+        if value is not None and not word.isdigit():
+            raise self.error(f"'{clean(word)}' is not a site", start, _SITES)
+        hint = (
+            ""
+            if self._is_drawn or word[wrong].isdigit()
+            else "begin a line with a title or a comment with '#'"
+        )
+        raise self.error(f"{shown(word[wrong])} is not a site", start + wrong, _SITES, hint)
+
+
+def _number(word: str) -> float | None:
+    """The number or truth value that a word is; None for other words."""
+    try:
+        return float({"true": "1", "false": "0"}.get(word.lower(), word))
+    except ValueError:
+        return None
 
 
 def _random(text: str, seed: int | None) -> Source:
@@ -156,22 +254,24 @@ def _random(text: str, seed: int | None) -> Source:
     return Source(atoms, f"{text}, seed {seed}", seed)
 
 
-def _npy(path: Path) -> Occupancy:
-    name = visible(str(path))
-    expected = "a two-dimensional array of bool, or of 0 and 1, saved by numpy.save"
-    if path.stat().st_size > MAX_NPY_BYTES:
-        raise ConfigError(Problem("it is larger than 32 MiB", name, expected=_size_limit()))
-    try:
-        with path.open("rb") as file:
-            array = read_array(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError, MemoryError, OverflowError, TypeError) as error:
-        reason = visible(str(error).partition(";")[0].partition("\n")[0])
-        what = f"it cannot be read: {reason}" if reason else "it is damaged"
-        raise ConfigError(Problem(what, name, expected=expected)) from error
-    if array.ndim != 2 or array.dtype.kind not in "biuf":
-        what = f"it holds an array of shape {array.shape} and type {array.dtype}"
-        raise ConfigError(Problem(what, name, expected=expected))
-    return _checked(array, name)
+def _array(path: Path, name: str, index: str | None, label: str) -> Occupancy:
+    """Read (n_rows, n_cols), or one of (n, n_rows, n_cols)."""
+    with opened_array(path, name) as array:
+        if array.ndim == 3:
+            array = array[_index(index, array.shape[0], label)]
+        elif array.ndim != 2 or index is not None:
+            what = f"it holds an array of shape {array.shape}"
+            expected = "(rows, columns), or with '#' and an index (occupancies, rows, columns)"
+            raise ConfigError(Problem(what, label, expected=expected))
+        return _checked(array, label)
+
+
+def _index(text: str | None, n: int, label: str) -> int:
+    if text is None:
+        raise ConfigError(Problem(f"it holds {n} occupancies", label, expected=f"{label}#0 for the first"))
+    if re.fullmatch(r"[0-9]{1,9}", text) and int(text) < n:
+        return int(text)
+    raise ConfigError(Problem(f"there is no occupancy '{clean(text)}'", label, expected=f"0 to {n - 1}"))
 
 
 def _checked(array: NDArray[Any], name: str) -> Occupancy:
@@ -191,7 +291,8 @@ def _shot(path: Path, cycle: str | None) -> Source:
     try:
         content = read_content(path)
     except RecordingError as error:
-        raise ConfigError(Problem(error.text, name, expected="a shot's file")) from error
+        hint = f"name the array of another program's file: {clean(path.name)}:DATASET"
+        raise ConfigError(Problem(error.text, name, expected="a shot's file", hint=hint)) from error
     cycles, images = content.record.cycles, content.record.images
     if not cycles:
         raise ConfigError(Problem("this shot has no cycles", name, expected="a shot that was rearranged"))

@@ -68,10 +68,11 @@ def plan(
         str,
         typer.Argument(
             metavar="OCCUPANCY",
-            help="A .npy file; a text file of 0 and 1, or '-' for such a text on standard input; the shot "
-            "file run/shots/shot_000003.h5#2 (the image that cycle 2 was planned on, counted from 0; "
-            "default: 0); or "
-            "random:20x20@0.75 (each site filled with that probability).",
+            help="A text file of 0 and 1, or '-' for such a text on standard input; a .npy file, or an array "
+            "of a .npz or HDF5 file, such as loadings.h5:loaded#3 (of several occupancies the one with "
+            "index 3, counted from 0); the shot file run/shots/shot_000003.h5#2 (the image that cycle 2 was "
+            "planned on, counted from 0; default: 0); or random:20x20@0.75 (each site filled with that "
+            "probability).",
             show_default=False,
         ),
     ],

@@ -23,8 +23,9 @@ class FramesSettings(OrientationSettings):
     """Frames from files instead of a camera."""
 
     path: FilePath = Field(
-        description="files to play, relative to this file: the folder of a run, a TIFF stack, a folder of "
-        "PNG or of TIFF files, or a pattern such as `frames/*.png`; files in the natural order of their names"
+        description="files to play, relative to this file: the folder of a run, a TIFF stack, a .npy file, "
+        "an array of a .npz or HDF5 file (`file.h5:Andor/Pictures`), a folder of PNG, TIFF or .npy files, or "
+        "a pattern such as `frames/*.png`; files in the natural order of their names"
     )
     images: Literal["all", "first"] = Field(
         default="all",

@@ -1,4 +1,4 @@
-"""Frames in files: runs of labseq, TIFF stacks, PNG files."""
+"""Frames in files: runs of labseq, TIFF stacks, PNG files, arrays of numpy and HDF5."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import difflib
 import importlib
 import logging
 import re
+from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,23 +16,30 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Problem
+from labseq.plugin import ConfigError, Problem
+from labseq.plugin.arrays import ARRAY_FILES, opened_array, split_name
 from labseq.plugin.messages import install_hint
 from labseq.plugin.runs import RecordingError, Run, open_run
 
-PNG: Final = (".png",)
-TIFF: Final = (".tif", ".tiff")
-EXPECTED: Final = "a run's folder, a TIFF stack, or a folder of PNG or TIFF files"
+PNG: Final[tuple[str, ...]] = (".png",)
+TIFF: Final[tuple[str, ...]] = (".tif", ".tiff")
+IN_FOLDERS: Final = (*PNG, *TIFF, ".npy")
+EXPECTED: Final = (
+    "a run's folder, a TIFF stack, a .npy file, a dataset such as file.h5:Andor/Pictures, "
+    "or a folder of PNG, TIFF or .npy files"
+)
+COUNTS: Final = "counts from 0 to 65535, as the camera gave them"
+
+_KINDS: Final = dict.fromkeys(PNG, "PNG") | dict.fromkeys(TIFF, "TIFF") | dict.fromkeys(ARRAY_FILES, "array")
 
 PNG_KINDS: Final = {
     "1": "1 bit gray",
-    "L": "8 bit gray",
     "LA": "gray with transparency",
     "P": "palette colour",
     "RGB": "colour",
     "RGBA": "colour with transparency",
 }
-"""Pictures in PNG files that are not 16 bit gray, by Pillow's mode."""
+"""Pictures in PNG files that are not gray, by Pillow's mode."""
 
 _LOG = logging.getLogger("tifffile")
 _LOG.addHandler(logging.NullHandler())  # we report what it logs about damaged files
@@ -84,7 +92,7 @@ def find_source(path: Path, images: Literal["all", "first"] = "all") -> Source:
     """Find the frames at a path, and check the header of each file.
 
     Args:
-        path: A run's folder, a TIFF stack, a PNG, a folder of either, or a pattern for files.
+        path: A run's folder, a TIFF stack, a PNG, an array of numpy or HDF5, a folder of files, or a pattern.
         images: Which frames of a run.
 
     Raises:
@@ -101,15 +109,16 @@ def find_source(path: Path, images: Literal["all", "first"] = "all") -> Source:
     return source
 
 
-def _find(path: Path, images: Literal["all", "first"]) -> Source:
+def _find(address: Path, images: Literal["all", "first"]) -> Source:
+    path, name = split_name(address)
     if path.is_dir():
         return _in_folder(path, images)
     if path.is_file():
-        return _of_kind(path, [path])
+        return _of_kind(path, [path], name)
     if path.exists():
         raise BadFramesError(path, "is neither a file nor a folder", EXPECTED)
     if re.search(r"[*?\[]", str(path)):
-        return _of_kind(path, _matching(path))
+        return _of_kind(path, _matching(path), name)
     names = [sibling.name for sibling in path.parent.iterdir()] if path.parent.is_dir() else []
     similar = difflib.get_close_matches(path.name, names, n=1)
     hint = f"did you mean '{similar[0]}'?" if similar else "check `path`; it is relative to the profile"
@@ -118,7 +127,7 @@ def _find(path: Path, images: Literal["all", "first"]) -> Source:
 
 def _in_folder(folder: Path, images: Literal["all", "first"]) -> Source:
     """A run, or the pictures in a folder; the folder of a run may contain pictures, too."""
-    files = [file for file in folder.iterdir() if file.suffix.lower() in (*PNG, *TIFF)]
+    files = [file for file in folder.iterdir() if file.suffix.lower() in IN_FOLDERS]
     files = [file for file in files if file.is_file() and not file.name.startswith(".")]
     if files and not (folder / "run.json").is_file():
         return _of_kind(folder, files)
@@ -128,7 +137,7 @@ def _in_folder(folder: Path, images: Literal["all", "first"]) -> Source:
         reason = str(error).removeprefix(f"{error.path}: ")
         if files or error.path != str(folder.resolve()):
             raise BadFramesError(Path(error.path), reason) from error
-        raise BadFramesError(folder, f"holds no PNG or TIFF files, and {reason}") from error
+        raise BadFramesError(folder, f"holds no PNG, TIFF or .npy files, and {reason}") from error
 
 
 def _matching(path: Path) -> list[Path]:
@@ -147,15 +156,23 @@ def _matching(path: Path) -> list[Path]:
     return files
 
 
-def _of_kind(path: Path, files: Sequence[Path]) -> Source:
+def _of_kind(path: Path, files: Sequence[Path], name: str = "") -> Source:
+    """The frames of files of one kind; of arrays with a name, those of this name."""
     files = sorted(files, key=natural)
-    pngs, tiffs = ([file for file in files if file.suffix.lower() in kind] for kind in (PNG, TIFF))
-    if others := [file for file in files if file.suffix.lower() not in (*PNG, *TIFF)]:
-        raise BadFramesError(others[0], "is neither a TIFF nor a PNG", EXPECTED)
-    if pngs and tiffs:
-        text = f"contains {len(pngs)} PNG and {len(tiffs)} TIFF files"
-        raise BadFramesError(path, text, "files of one kind", "give a pattern such as *.png")
-    return png_source(pngs) if pngs else tiff_source(tiffs)
+    kinds = {file: _KINDS.get(file.suffix.lower()) for file in files}
+    if other := next((file for file, kind in kinds.items() if kind is None), None):
+        raise BadFramesError(other, "is neither a TIFF nor a PNG, nor a file of arrays", EXPECTED)
+    counts = Counter(kinds.values())
+    if len(counts) > 1:
+        text = "contains " + " and ".join(f"{n} {kind}" for kind, n in counts.items()) + " files"
+        raise BadFramesError(path, text, "files of one kind", f"give a pattern such as *{files[0].suffix}")
+    match kinds[files[0]]:
+        case "PNG":
+            return png_source(files)
+        case "TIFF":
+            return tiff_source(files)
+        case _:
+            return array_source(files, name)
 
 
 def natural(path: Path) -> tuple[list[str | int], str]:
@@ -196,6 +213,20 @@ def _check_shape(file: Path, shape: tuple[int, ...], first: Path, expected: tupl
     if shape != expected:
         text = f"its frames have {format_shape(shape)} pixels, those of {first.name} {format_shape(expected)}"
         raise BadFramesError(file, text, "frames of one size", "play them one size at a time")
+
+
+def _counts(pixels: NDArray[Any], place: str) -> NDArray[np.uint16]:
+    """The counts of a frame of integers; nothing is scaled or cut off.
+
+    Raises:
+        BadFramesError: They do not fit into 16 bits.
+    """
+    if not np.can_cast(pixels.dtype, np.uint16):
+        low, high = int(pixels.min(initial=0)), int(pixels.max(initial=0))
+        if low < 0 or high > 65535:
+            what = f"the frame has counts from {low} to {high}"
+            raise BadFramesError(place, what, COUNTS, "save frames from which nothing is subtracted")
+    return np.array(pixels, np.uint16, order="C")  # a copy, as the pixels of a .npy file are on the disk
 
 
 # runs
@@ -242,13 +273,13 @@ def _run_pictures(run: Run, *, first_only: bool) -> Generator[Picture]:
 
 
 def png_source(files: Sequence[Path]) -> Source:
-    """One frame from each PNG file, 16 bit gray, read with Pillow.
+    """One frame from each PNG file, 8 or 16 bit gray, read with Pillow.
 
     Args:
         files: In order; at least one.
 
     Raises:
-        BadFramesError: A file is not a PNG, not 16 bit gray, or of another size.
+        BadFramesError: A file is not a PNG, not gray, or of another size.
     """
     pillow = load("PIL.Image", "Pillow", files[0])
     expected = _png_shape(pillow, files[0])
@@ -261,17 +292,17 @@ def _png_pictures(pillow: Any, files: Sequence[Path]) -> Generator[Picture]:
     for file in files:
         with _opened_png(pillow, file) as opened:
             pixels = np.asarray(opened)
-        yield Picture(pixels.astype(np.uint16), str(file))  # older versions of Pillow give int32
+        yield Picture(_counts(pixels, str(file)), str(file))
 
 
 def _png_shape(pillow: Any, file: Path) -> tuple[int, int]:
     """(height, width), from the header."""
     with _opened_png(pillow, file) as opened:
         mode, (width, height) = opened.mode, opened.size
-    if mode not in ("I;16", "I"):  # the second is that of older versions
+    if mode not in ("L", "I;16", "I"):  # older versions of Pillow call 16 bit "I"
         text = f"the picture is {PNG_KINDS.get(mode, mode)}"
         hint = "save the camera's own counts, not a viewer's picture"
-        raise BadFramesError(file, text, "16 bit gray", hint)
+        raise BadFramesError(file, text, "8 or 16 bit gray", hint)
     return height, width
 
 
@@ -292,14 +323,14 @@ def _opened_png(pillow: Any, file: Path) -> Generator[Any]:
 
 
 def tiff_source(files: Sequence[Path]) -> Source:
-    """One frame from each page of each TIFF file, uint16, read with tifffile one page at a time.
+    """One frame from each page of each TIFF file, integers, read with tifffile one page at a time.
 
     Args:
         files: In order; at least one.
 
     Raises:
-        BadFramesError: tifffile is missing; a file is not a TIFF, is cut off, or its first page is not
-            uint16, not gray, or of another size.
+        BadFramesError: tifffile is missing; a file is not a TIFF, is cut off, or its first page does not
+            hold integers, is not gray, or of another size.
     """
     tifffile = load("tifffile", "tifffile", files[0])
     n_pages = 0
@@ -319,7 +350,8 @@ def _tiff_pictures(tifffile: Any, files: Sequence[Path]) -> Generator[Picture]:
         with _opened_tiff(tifffile, file) as stack:
             for number, page in enumerate(stack.pages):
                 _tiff_shape(file, number, page)
-                yield Picture(np.ascontiguousarray(page.asarray(), np.uint16), f"{file}, page {number}")
+                place = f"{file}, page {number}"
+                yield Picture(_counts(page.asarray(), place), place)
 
 
 @contextmanager
@@ -336,9 +368,10 @@ def _opened_tiff(tifffile: Any, file: Path) -> Generator[Any]:
 
 
 def _tiff_shape(file: Path, number: int, page: Any) -> tuple[int, int]:
-    if page.dtype != np.uint16 or len(page.shape) != 2:
+    if page.dtype is None or page.dtype.kind not in "iu" or len(page.shape) != 2:
         text = f"page {number} is {page.dtype}, {format_shape(page.shape)}"
-        raise BadFramesError(file, text, "uint16, height x width", "save the camera's own counts, gray")
+        hint = "save the camera's own counts, gray"
+        raise BadFramesError(file, text, "integers, height x width", hint)
     return page.shape
 
 
@@ -360,3 +393,55 @@ def _count_pages(file: Path, stack: Any) -> int:
         text = f"holds {shape} counts behind a single page, as large ImageJ stacks do"
         raise BadFramesError(file, text, "a page for each frame", "save it as BigTIFF, or in several files")
     return n_pages
+
+
+# arrays of numpy and HDF5
+
+
+def array_source(files: Sequence[Path], name: str = "") -> Source:
+    """Frames in arrays: (n, height, width), or (height, width) for one.
+
+    A frame at a time is read, except of .npz files, which cannot be read in parts.
+
+    Args:
+        files: In order; at least one.
+        name: Which array of a .npz or HDF5 file; "" for the only one.
+
+    Raises:
+        BadFramesError: A file cannot be read, or its array holds no integers, or frames of another size.
+    """
+    n_frames = 0
+    first: tuple[int, ...] = ()
+    for file in files:
+        with _opened_frames(file, name) as frames:
+            first = first or frames.shape[-2:]
+            _check_shape(file, frames.shape[-2:], files[0], first)
+            n_frames += _n_frames(frames)
+    about = {"source": "array", "n_files": len(files), "n_frames": n_frames}
+    return Source(lambda: _array_pictures(files, name), about | ({"array": name} if name else {}))
+
+
+def _array_pictures(files: Sequence[Path], name: str) -> Generator[Picture]:
+    for file in files:
+        with _opened_frames(file, name) as frames:
+            for i in range(_n_frames(frames)):
+                place = f"{file}, frame {i}"
+                yield Picture(_counts(frames[i if frames.ndim == 3 else ...], place), place)
+
+
+def _n_frames(frames: Any) -> int:
+    return frames.shape[0] if frames.ndim == 3 else 1
+
+
+@contextmanager
+def _opened_frames(file: Path, name: str) -> Generator[Any]:
+    try:
+        with opened_array(file, name) as frames:
+            if frames.dtype.kind not in "iu" or frames.ndim not in (2, 3):
+                text = f"it holds {frames.dtype}, {format_shape(frames.shape)}"
+                hint = "save the camera's own counts"
+                raise BadFramesError(file, text, "integers, frames x height x width", hint)
+            yield frames
+    except ConfigError as error:
+        (problem,) = error.problems
+        raise BadFramesError(problem.source, problem.what, problem.expected, problem.hint) from error

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -204,6 +205,36 @@ def test_stacks_of_many_kinds_give_the_same_counts(tmp_path: Path, options: dict
     )
     player = Player(file).open()
     assert all(np.array_equal(player.take().image, pixels) for pixels in frames)
+
+
+@pytest.mark.parametrize("dtype", ["u1", "i1", ">u2", "i2", "i4", "u8", "i8"])
+def test_arrays_and_pictures_of_any_integers_that_fit_give_the_same_counts(
+    tmp_path: Path, dtype: str
+) -> None:
+    frames = np.random.default_rng(1).integers(0, 128, (4, 20, 30)).astype(dtype)
+    np.save(tmp_path / "x.npy", np.asarray(frames, order="F"))
+    np.savez(tmp_path / "x.npz", pictures=frames, time=np.arange(4))
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file.create_dataset("Andor/Pictures", data=frames, chunks=True, compression="gzip")
+    tifffile.imwrite(tmp_path / "x.tif", frames, photometric="minisblack")
+    paths = ["x.npy", "x.npz:pictures", "x.h5", "x.h5:Andor/Pictures", "*.h5:Andor/Pictures", "x.tif"]
+    if dtype == "u1":
+        for i, pixels in enumerate(frames):
+            Image.fromarray(pixels).save(tmp_path / f"x{i}.png")
+        paths.append("x*.png")
+    for path in paths:
+        player = Player(tmp_path / path).open()
+        for pixels in frames:
+            image = player.take().image
+            assert (image.dtype, image.flags.owndata) == (np.uint16, True)
+            np.testing.assert_array_equal(image, pixels, path)
+        player.camera.close()
+
+
+def test_a_folder_of_arrays_is_played_in_the_natural_order(tmp_path: Path) -> None:
+    for i, pixels in enumerate(stack_of(11)):
+        np.save(tmp_path / f"shot{i}.npy", pixels)
+    assert Player(tmp_path).open().firsts(11) == [1000 * i for i in range(11)]
 
 
 def test_after_the_last_frame_the_run_ends_or_begins_again(tmp_path: Path) -> None:

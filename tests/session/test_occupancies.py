@@ -49,8 +49,8 @@ def test_a_fresh_seed_is_named_and_repeats_the_draw() -> None:
         ("random:20x20@1.5", "the filling fraction is '1.5'; expected a number from 0 to 1"),
         ("random:20x20@nan", "the filling fraction is 'nan'"),
         ("random:20x1001@0.75", "20 x 1001 sites; expected 1 to 1000"),
-        ("", "the occupancy is an empty text; expected a .npy file"),
-        ("nowhere.npy", "nowhere.npy: there is no such file; expected a .npy file, a text file"),
+        ("", "the occupancy is an empty text; expected a text file"),
+        ("nowhere.npy", "nowhere.npy: there is no such file; expected a text file of 0 and 1, a .npy file"),
         ("x" * 5000, "there is no such file"),
     ],
 )
@@ -72,7 +72,7 @@ def test_npy_of_any_number_type(tmp_path: Path, dtype: Any, order: Any) -> None:
 @pytest.mark.parametrize(
     ("array", "words"),
     [
-        (np.zeros((2, 3, 4)), "an array of shape (2, 3, 4)"),
+        (np.zeros((2, 3, 4)), "a.npy: it holds 2 occupancies; expected"),
         (np.array([["1", "0"]]), "type <U1"),
         (np.array([[1, 2]]), "only 0 and 1"),
         (np.array([[np.nan, 1.0]]), "only 0 and 1"),
@@ -87,12 +87,56 @@ def test_npy_of_other_content_is_refused(tmp_path: Path, array: Any, words: str)
     assert "expected" in text
 
 
+def test_one_of_several_occupancies_in_the_files_of_other_programs(tmp_path: Path) -> None:
+    stack = np.array([~ARRAY, ARRAY])
+    np.save(tmp_path / "a.npy", stack.astype(np.int64))
+    np.savez(tmp_path / "one.npz", ARRAY.astype(float))
+    np.savez_compressed(tmp_path / "two.npz", loaded=stack, after=stack)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["scan 1/loaded"], file["time"] = stack, np.arange(3.0)
+        file["names"] = "a text"
+    for address in (
+        "a.npy#1",
+        "one.npz",
+        "two.npz:loaded#1",
+        "a.h5:scan 1/loaded#1",
+        "a.h5:/scan 1/loaded#1",
+    ):
+        assert np.array_equal(read_source(str(tmp_path / address)).occupancy, ARRAY), address
+
+    for address, words in (
+        ("two.npz", "two.npz: it holds 2 arrays; expected one of loaded, after; name one: two.npz:loaded"),
+        ("two.npz:load#1", "it holds no array 'load'; expected one of loaded, after; did you mean 'loaded'?"),
+        ("two.npz:loaded", "it holds 2 occupancies; expected"),
+        ("two.npz:loaded#2", "there is no occupancy '2'; expected 0 to 1"),
+        ("one.npz#0", "an array of shape (2, 3); expected (rows, columns), or with '#'"),
+        ("a.h5", "is not a shot's file of labseq; expected a shot's file; name the array"),
+        ("a.h5:time", "holds no array 'time'; expected scan 1/loaded (2, 2, 3)"),
+        ("b.npz", "there is no such file"),
+    ):
+        assert words in message(tmp_path / address)
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.h5:x", "a.hdf5"])
+def test_a_damaged_file_of_arrays_is_refused_wherever_it_is_cut_off(tmp_path: Path, name: str) -> None:
+    file = tmp_path / name.partition(":")[0]
+    if file.suffix == ".npz":
+        np.savez(file, ARRAY)
+    else:
+        with h5py.File(file, "w") as content:
+            content["x"] = ARRAY
+    whole = file.read_bytes()
+    for length in range(0, len(whole), 97):
+        file.write_bytes(whole[:length])
+        assert "expected" in message(tmp_path / name)
+
+
 @pytest.mark.parametrize(
     "content", [b"", b"1 0 1", b"\x93NUMPY", b"\x93NUMPY\x01\x00\xff\xff{", b"PK\x03\x04"]
 )
 def test_a_file_that_is_no_npy_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.npy").write_bytes(content)
-    assert "expected a two-dimensional array" in message(tmp_path / "a.npy")
+    assert "expected an array of numbers, as numpy.save writes it" in message(tmp_path / "a.npy")
 
 
 @pytest.mark.parametrize(
@@ -103,6 +147,12 @@ def test_a_file_that_is_no_npy_is_refused(tmp_path: Path, content: bytes) -> Non
         b"#.#\r..#",
         b"\n  \n1\t0\t1\n0;0;1\n\n",
         b"\xef\xbb\xbf101\n001",
+        b"# by numpy.savetxt\n1.000000000000000000e+00 0.0 1.\n#\n0 0 1.0 # the last\n# 3 atoms\n",
+        b"1.0;0.0;1.0\r\n0.0;0.0;1.0\r\n",
+        b"True,False,True\nFALSE,FALSE,TRUE\n",
+        b"[[1, 0, 1], [0, 0, 1]]",
+        b"[[ True False\n   True]\n [False False  True]]\n",
+        b"#\r1 0 1\r0 0 1\r",
     ],
 )
 def test_texts_in_any_usual_form(text: bytes) -> None:
@@ -125,7 +175,21 @@ def test_texts_are_read_as_they_were_written(occupancy: Occupancy, signs: str, b
         (b"102\n", "mine:1:3: '2' is not a site; expected 0 or '.'"),
         (b"10\n1\x00\n", r"mine:2:2: '\x00' is not a site"),
         (b"10\n1\xff\n", "mine:2:2: byte 0xFF at offset 4 is not UTF-8"),
-        (b"1" * (MAX_BYTES + 1), "it is larger than 4 MiB"),
+        (b"1.1 0.0\n", "mine:1:1: '1.1' is not a site"),
+        (b"1.0 0.5\n", "mine:1:5: '0.5' is not a site"),
+        (b"1.0 nan\n", "mine:1:5: 'nan' is not a site"),
+        (b"1,0 0,0\n", "mine:1:4: the separator after '0' differs"),
+        (b"1,0;0,0\n", "mine:1:4: the separator after '0' differs"),
+        (b"1,,0\n", "mine:1:2: the separator after '1' differs"),
+        (b"1 0 1\n#.#\n", "mine:2:1: a row of '#' and '.' among rows of numbers"),
+        (b"1 0\n\n# next\n0 1\n", "mine:2:1: this row has 0 sites; expected 2, as in line 1"),
+        (
+            b"a b\n1 0\n",
+            "mine:1:1: 'a' is not a site; expected 0 or '.' for an empty site, 1 or '#' for an atom; begin",
+        ),
+        (b"[[1, 0], 1]\n", "mine:1:10: '1' is not within a row"),
+        (b"[[1, 0],\n [1]]\n", "mine:2:4: this row has 1 sites"),
+        (b"1" * (MAX_BYTES + 1), "it is larger than 32 MiB"),
     ],
 )
 def test_other_texts_are_refused_with_their_place(text: bytes, words: str) -> None:
