@@ -401,6 +401,8 @@ def _of_validator(text: str, name: str, plain: str) -> Problem:
 
 def _type_hint(kind: str, value: Any) -> str:
     """A hint for a text in the place of a number or a switch, or vice versa."""
+    if kind.startswith("int") and isinstance(value, float) and value.is_integer():
+        return f"write {value:.0f}"
     if not isinstance(value, str):
         is_word = isinstance(value, bool | int | float) and kind == "string_type"
         return "put it in quotes" if is_word else ""
@@ -414,7 +416,8 @@ def _type_hint(kind: str, value: Any) -> str:
         except ValueError:
             return ""
         is_right = type(number) is int or (type(number) is float and kind.startswith("float"))
-        hint = f"did you mean {number}?" if "_" in value else f"write {number} without quotes"
+        is_other = str(number) != value  # 1_000, or 1e3
+        hint = f"did you mean {number}?" if is_other else f"write {number} without quotes"
         return hint if is_right else ""
     return ""
 

@@ -318,6 +318,10 @@ class _Composer(yaml.SafeLoader):
                 self.report(mark, str(error), "a number of a few digits")
         elif any("\ud800" <= char <= "\udfff" for char in text):
             self.report(mark, "an escape in this text is half of a character", "the character itself")
+        elif node.style == '"' and (escape := _IN_WINDOWS_PATH.match(text)):
+            written = repr(escape[1])[1:-1]
+            what = f"in double quotes '{written}' is a control character, not a part of a path"
+            self.report(mark, what, "", _PATH_HINT)
         return Node(text, self._mark(mark))
 
 
@@ -345,14 +349,14 @@ _FLOAT: Final = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0
 
 
 def resolve(text: str) -> Scalar:
-    """The value of an unquoted scalar by the core rules of YAML 1.2.
+    """The value of an unquoted scalar by the core rules of YAML 1.2, but that 1e3 is a whole number.
 
     Raises:
         ValueError: A number of more than :data:`MAX_DIGITS` characters.
 
     Example:
         >>> resolve("0x10"), resolve("1e3"), resolve("on"), resolve("10:30"), resolve("~")
-        (16, 1000.0, 'on', '10:30', None)
+        (16, 1000, 'on', '10:30', None)
     """
     if text in _WORDS:
         return _WORDS[text]
@@ -363,7 +367,11 @@ def resolve(text: str) -> Scalar:
         raise ValueError(f"a number of {len(text)} characters is too long")
     if is_coded:
         return int(text, 0)
-    return int(text, 10) if is_int else float(text)
+    if is_int:
+        return int(text, 10)
+    number = float(text)
+    is_whole = "e" in text.lower() and number.is_integer() and abs(number) < 2**53  # floats are exact below
+    return int(number) if is_whole else number
 
 
 # U+0085, U+2028 and U+2029 are line breaks for PyYAML but for few editors, so
@@ -400,6 +408,9 @@ def _check_characters(text: str, source: str, is_option: bool) -> None:
     raise Mark(source, *place).error(what, expected, hint)
 
 
+_PATH_HINT: Final = "put a path into single quotes, or write '/' or two backslashes for each backslash"
+_IN_WINDOWS_PATH: Final = re.compile(r"(?:[A-Za-z]:|\\\w[^/]*)([\0\a\b\t\n\v\f\r\x1b])\w")
+"""A path such as "C:\\new" in double quotes, in which YAML reads an escape."""
 _QUOTE_IT: Final = "put text with special characters in single quotes"
 
 
@@ -428,6 +439,8 @@ def explain_syntax_error(
         return _wrong_in_brackets(text, opened, at)
     if problem.startswith("expected <block end>"):
         return _late_quote(last, at) or _out_of_place(text, since, at)
+    if "escape character" in problem or "expected escape sequence" in problem:
+        return _wrong_escape(text, at)
     if "quoted scalar" in (error.context or "") and "unexpected" in problem:
         return _at(since, "the quotation mark that opens here is never closed")
     return _at(at, f"this is not valid YAML: {clean(problem.removeprefix('but '))}", "", _QUOTE_IT)
@@ -435,6 +448,14 @@ def explain_syntax_error(
 
 def _at(mark: YamlMark, what: str, expected: str = "", hint: str = "") -> Problem:
     return Problem(what, "", mark.line + 1, mark.column + 1, expected, hint)
+
+
+def _wrong_escape(text: str, at: YamlMark) -> Problem:
+    """Explain a backslash in double quotes, mostly of a path of Windows."""
+    start = text.rindex("\\", 0, at.index + 1)
+    escape = clean(text[start : start + 2])
+    what = f"in double quotes a backslash begins an escape, and '{escape}' is not a complete one"
+    return Problem(what, "", at.line + 1, at.column + 1 - (at.index - start), "", _PATH_HINT)
 
 
 def _missing_colon(text: str, since: YamlMark) -> Problem:

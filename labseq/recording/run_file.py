@@ -173,6 +173,15 @@ def read_state(folder: Path) -> tuple[RunStatus, str]:
     return "running", ""
 
 
+def describe_end(folder: Path) -> str:
+    """How a run ended that may have left devices on, as the end of a sentence about it."""
+    state = read_state_file(folder)
+    if state.get("state") in (None, "running"):
+        return "died"
+    error = state.get("error")
+    return f"did not leave all of them safe ({error})" if error else "did not leave all of them safe"
+
+
 def read_owner(folder: Path) -> Process | None:
     """The process that runs or ran a run; None if unknown."""
     return Process.from_plain(read_state_file(folder))

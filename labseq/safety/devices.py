@@ -19,6 +19,7 @@ from labseq.guard import Guard, StopFlag, stop_on_signals
 from labseq.kernels.kernel import load_kernels
 from labseq.model.policies import Timeouts
 from labseq.recording import find_dead_run
+from labseq.recording.run_file import describe_end
 from labseq.roles import Hardware, Simulation, in_opening_order, overrides
 from labseq.safety.locks import lock_devices
 from labseq.safety.safe import construct_hardware
@@ -100,7 +101,8 @@ def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun =
         stack.enter_context(lock_devices(hardware, "labseq devices", warnings.append))
         if (dead := find_dead_run(hardware.key, hardware.identities)) is not None and dry_run == "off":
             text = (
-                f"the last run on these devices ({dead}) died; 'labseq safe {profile}' makes all of them safe"
+                f"the last run on these devices ({dead}) {describe_end(dead)}; "
+                f"'labseq safe {profile}' makes all of them safe"
             )
             warnings.append(text)
         stack.enter_context(stop_on_signals(stop))

@@ -26,11 +26,12 @@ from labseq.errors import (
     StopRequested,
 )
 from labseq.guard import Guard, StopFlag, stop_on_signals
-from labseq.messages import clean
+from labseq.messages import one_line
 from labseq.model.policies import Timeouts
 from labseq.plain import now
 from labseq.processes import HANG_S, Holder, Lock, Process
 from labseq.recording import clear_active, lock_file
+from labseq.recording.run_file import describe_end
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, in_safe_order
 from labseq.safety.locks import device_text, end_holders, lock_devices
 from labseq.sequencer.clock import RealClock, VirtualClock
@@ -169,10 +170,10 @@ def make_safe_after_crash(
         LabseqError: The first device that is not safe.
         StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
-    text = f"the last run on these devices ({dead}) died; they are made safe first"
+    text = f"the last run on these devices ({dead}) {describe_end(dead)}; they are made safe first"
     observer.event("warning", {"text": text})
     for line in watchdog_lines(dead):
-        observer.event("warning", {"text": f"its watchdog: {clean(line)}"})
+        observer.event("warning", {"text": f"its watchdog: {one_line(line)}"})
     failures = make_profile_devices_safe(hardware, stop, observer).failures
     if failures:
         raise failures[0]

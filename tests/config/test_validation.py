@@ -236,6 +236,7 @@ def test_python_and_numpy_values() -> None:
 @pytest.mark.parametrize(
     ("model", "values", "message"),
     [
+        (Model, {"rows": 3.0}, "rows is 3.0; expected a whole number; write 3"),
         (Model, {"rows": "3"}, "rows is '3'; expected a whole number; write 3 without quotes"),
         (Model, {"rows": 1, "rwos": 3}, "'rwos' is not a setting of it; expected one of rows, fraction, "),
         (Model, {"rows": 1, "pair": (1, None)}, "pair.1 is empty; expected a whole number"),

@@ -62,7 +62,13 @@ name: compact-225 => name: 'compact'-225
 name: compact-225 => name: compact: 225
   3:14: a ':' is not allowed here; expected one 'key: value' on a line; put text that holds ': ' in quotes
 name: compact-225 => name: "C:\\data"
-  3:11: this is not valid YAML: found unknown escape character 'd'; put text with special characters in single quotes
+  3:10: in double quotes a backslash begins an escape, and '\\d' is not a complete one; put a path into single quotes, or write '/' or two backslashes for each backslash
+name: compact-225 => name: "C:\\Users\\lab"
+  3:10: in double quotes a backslash begins an escape, and '\\U' is not a complete one; put a path into single quotes, or write '/' or two backslashes for each backslash
+name: compact-225 => name: "C:\\new\\table"
+  3:7: in double quotes '\\n' is a control character, not a part of a path; put a path into single quotes, or write '/' or two backslashes for each backslash
+name: compact-225 => name: "\\\\server\\new"
+  3:7: in double quotes '\\n' is a control character, not a part of a path; put a path into single quotes, or write '/' or two backslashes for each backslash
 name: compact-225 => name: @home
   3:7: this is not valid YAML: found character '@' that cannot start any token; put text with special characters in single quotes
 name: compact-225 => name: *best*
@@ -111,6 +117,8 @@ shots: 20 => shots: "20"
   5:8: shots is '20'; expected a whole number; write 20 without quotes
 shots: 20 => shots: 1_000
   5:8: shots is '1_000'; expected a whole number; did you mean 1000?
+shots: 20 => shots: 1.5e0
+  5:8: shots is 1.5e0; expected a whole number
 shots: 20 => shots:
   5:7: shots is empty; expected a whole number
 shots: 20⏎ => ∅

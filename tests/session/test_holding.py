@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import signal
@@ -19,12 +20,13 @@ import pytest
 import labseq
 from labseq.assembly.profile import resolve_profile
 from labseq.errors import DeviceError
+from labseq.guard import StopFlag
 from labseq.plugin.serial import port_identities
 from labseq.processes import HANG_S, Lock, Process
 from labseq.recording import find_dead_run, lock_file, mark_active
 from labseq.safety.devices import check_devices
 from labseq.safety.locks import lock_devices
-from labseq.safety.safe import make_profile_safe
+from labseq.safety.safe import make_profile_safe, make_safe_after_crash
 from labseq.testing.fakes import RecordingObserver
 from tests.plugins.labseq_soapy_rig import until
 
@@ -188,6 +190,23 @@ def test_standing_by_makes_safe_what_a_process_that_dies_or_hangs_leaves_on() ->
         assert watching.communicate(timeout=120.0)[0] == ""
         assert watching.returncode == 0
     assert Path("log").read_text() == "safe safe "
+
+
+def test_what_the_last_run_may_have_left_on_is_told_in_whole_sentences(tmp_path: Path) -> None:
+    error = "DeviceTimeoutError: shutter: no reply to 'PING' within 1 s; is it switched on? check 'baud_rate'"
+    hardware, observer = resolve_profile("./p.yaml"), RecordingObserver()
+    (tmp_path / "STATE").write_text(json.dumps({"state": "failed", "error": error}), "utf-8")
+    row = {"cause": "could not make its devices safe", "device": "shutter", "ok": False, "text": error}
+    (tmp_path / "watchdog.jsonl").write_text(json.dumps(row | {"after_s": 5.2}) + "\n", "utf-8")
+    mark_active(hardware.key, hardware.identities, tmp_path)
+    make_safe_after_crash(tmp_path, hardware, StopFlag(), observer)
+    end, watchdog = (warning["text"] for warning in observer.of("warning"))
+    assert end == (
+        f"the last run on these devices ({tmp_path}) did not leave all of them safe ({error}); "
+        "they are made safe first"
+    )
+    because = "because the run could not make its devices safe"
+    assert watchdog == f"its watchdog: shutter NOT switched off, {because}: {error}"
 
 
 def child_of(stack: ExitStack, *arguments: str) -> Any:
