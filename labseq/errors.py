@@ -398,15 +398,17 @@ class StopRequested(LabseqError):  # noqa: N818 - a request, not an error
     """The user asked the run to stop; every wait raises it within 50 ms, or it is raised between two shots.
 
     Attributes:
-        signal_number: 2 for Ctrl-C (SIGINT), 15 for SIGTERM and for ``labseq stop``.
+        signal_number: 1 for a terminal that was closed (SIGHUP), 2 for Ctrl-C (SIGINT), 15 for SIGTERM and
+            for ``labseq stop``.
         after_shot: Whether ``labseq stop`` asked for it, and the current shot was completed.
     """
 
     def __init__(self, signal_number: int = 2, *, after_shot: bool = False) -> None:
         self.signal_number = signal_number
         self.after_shot = after_shot
-        by = "Ctrl-C" if signal_number == 2 else "SIGTERM"
-        super().__init__("stopped by 'labseq stop'" if after_shot else f"stopped by {by}")
+        causes = {1: "because the terminal was closed (SIGHUP)", 2: "by Ctrl-C"}
+        cause = "by 'labseq stop'" if after_shot else causes.get(signal_number, "by SIGTERM")
+        super().__init__(f"stopped {cause}")
 
 
 def one_of(names: Sequence[str]) -> str:

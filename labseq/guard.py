@@ -101,12 +101,12 @@ class StopFlag:
 
 
 _SIGHUP: Final = getattr(signal, "SIGHUP", None)
-_EXIT_SIGNALS: Final = {  # signal -> the signal that the run reports
+_EXIT_SIGNALS: Final[dict[Any, int]] = {  # signal -> the signal that the run reports
     getattr(signal, name): meaning
     for name, meaning in {
         "SIGINT": signal.SIGINT,
         "SIGTERM": signal.SIGTERM,
-        "SIGHUP": signal.SIGTERM,  # the terminal or the ssh connection is gone
+        "SIGHUP": 1,  # the terminal or the ssh connection is gone; Windows has no name for it
         "SIGBREAK": signal.SIGINT,  # Ctrl-Break on Windows
     }.items()
     if hasattr(signal, name)

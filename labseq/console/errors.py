@@ -71,7 +71,7 @@ def _line_of(problem: Problem) -> str | None:
 
 
 EXIT_SIGNALLED: Final = 128
-"""Added to the signal's number, as shells do: 130 for Ctrl-C, 143 for SIGTERM."""
+"""Added to the signal's number, as shells do: 129 for SIGHUP, 130 for Ctrl-C, 143 for SIGTERM."""
 EXIT_INTERRUPTED: Final = EXIT_SIGNALLED + 2
 EXIT_INTERNAL: Final = 1
 EXIT_CODES: Final = {
@@ -79,7 +79,7 @@ EXIT_CODES: Final = {
     "1": "the plan or the data: a planner failed or broke a rule, the disk is full; or labseq itself failed",
     "2": "a mistake in a file, an option or a setting, or a request that exceeds a limit",
     "3": "a device failed, did not answer, or could not be made safe",
-    "130, 143": "stopped by Ctrl-C; by SIGTERM or `labseq stop`",
+    "129, 130, 143": "stopped because the terminal was closed; by Ctrl-C; by SIGTERM or `labseq stop`",
 }
 """Exit codes of the commands -> meaning."""
 MAX_REPORTED: Final = 50

@@ -273,7 +273,9 @@ def error(error_type: type[LabseqError]) -> Definition:
     """An error, its fields and its exit code."""
     code = str(error_type.exit_code)
     if error_type is StopRequested:
-        code = " or ".join(str(exit_code_of(StopRequested(number))) for number in (SIGINT, SIGTERM))
+        hang_up = 1  # which Windows does not have
+        numbers = (hang_up, int(SIGINT), int(SIGTERM))
+        code = ", ".join(str(exit_code_of(StopRequested(number))) for number in numbers)
     return Definition(error_type.__name__, f"{docstring(error_type)}\n\nExit code {code}.")
 
 

@@ -217,7 +217,7 @@ def test_every_error_exit_code_and_event_is_in_the_reference() -> None:
     classes = [one for one in vars(errors).values() if isinstance(one, type)]
     every = [one for one in classes if issubclass(one, errors.LabseqError)]
     assert {*reference.errors_by_name().values()} == {*every}
-    codes = {one.exit_code for one in every} | {exit_code_of(errors.StopRequested(n)) for n in (2, 15)}
+    codes = {one.exit_code for one in every} | {exit_code_of(errors.StopRequested(n)) for n in (1, 2, 15)}
     assert {int(code) for text in EXIT_CODES for code in text.split(", ")} == codes | {0}
     emitted = re.findall(r'(?:event|emit|log|_log_event)\(\s*"([a-z_]+)"', sources("labseq"))
     assert {*emitted} <= {*roles.EVENTS}
