@@ -54,6 +54,8 @@ class Options:
         dry_run: "full": every device by its simulator if its plugin has one, else by its virtual twin;
             "fast": virtual twins only; or "off".
         realtime: Let virtual time pass at the speed of real time.
+        note: A note about the run, for people.
+        tags: Words to find the run by.
     """
 
     profile: str | Path | None = None
@@ -63,6 +65,8 @@ class Options:
     output: Path | None = None
     dry_run: DryRun = "off"
     realtime: bool = False
+    note: str = ""
+    tags: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.profile, str | Path | None):  # pyright: ignore[reportUnnecessaryIsInstance]

@@ -19,7 +19,8 @@ from labseq.config.find import find_profile, find_sequence
 from labseq.data import Run, open_run
 from labseq.errors import ConfigError, Problem
 from labseq.messages import visible
-from labseq.recording.folders import RUN_FILE, runs_in
+from labseq.recording.folders import RUN_FILE
+from labseq.recording.listing import runs_in
 from labseq.settings import Settings
 from labseq.text_files import read_bytes
 

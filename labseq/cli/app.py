@@ -25,6 +25,7 @@ from labseq.console.options import (
     FitSettings,
     Json,
     Keys,
+    Note,
     Output,
     Overrides,
     Plugins,
@@ -37,6 +38,7 @@ from labseq.console.options import (
     Seed,
     SequenceFile,
     Shots,
+    Tags,
     Where,
     Workers,
     dry_run_mode,
@@ -73,6 +75,11 @@ Examples:
   labseq runs
   labseq runs --name kagome --limit 5
   labseq show kagome
+"""
+NOTE_EXAMPLES: Final = """\b
+Examples:
+  labseq note 75 "new objective"
+  labseq note 75 --tag lifetime --tag good
 """
 EXPORT_EXAMPLES: Final = """\b
 Examples:
@@ -159,6 +166,8 @@ def run(
     output: Output = None,
     as_json: Json = False,
     realtime: Realtime = False,
+    note: Note = "",
+    tags: Tags = None,
     web: Annotated[
         bool, typer.Option("--web", help="Also show the run in a browser, as `labseq web` does.")
     ] = False,
@@ -169,7 +178,8 @@ def run(
     from labseq.cli.run import run_sequence
 
     changes = tuple(overrides or ())
-    options = Options(profile, shots, seed, changes, output, dry_run_mode(dry_run), realtime)
+    dry_run_kind, given_tags = dry_run_mode(dry_run), tuple(tags or ())
+    options = Options(profile, shots, seed, changes, output, dry_run_kind, realtime, note, given_tags)
     run_sequence(sequence, options, as_json=as_json, web=web)
 
 
@@ -298,6 +308,30 @@ def runs(
     from labseq.cli.runs import list_runs
 
     list_runs(data, name, limit, as_json=as_json)
+
+
+@app.command(epilog=NOTE_EXAMPLES, short_help="Write a note about a run, or tag it.")
+def note(
+    run: Annotated[Path, run_argument("The run's folder, name or number.")],
+    text: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="TEXT", help="The note, instead of the present one; '' removes it.", show_default=False
+        ),
+    ] = None,
+    tags: Tags = None,
+    untag: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TAG", help="Remove a tag; may be given several times."),
+    ] = None,
+) -> None:
+    """Write a note about a run and tag it, finished or not; print what it then has.
+
+    labseq runs and the web page show and search note and tags.
+    """
+    from labseq.cli.runs import write_note
+
+    write_note(run, text, tags or (), untag or ())
 
 
 app.command(epilog=SERVE_EXAMPLES, short_help="Serve devices to a labseq on another computer.")(serve_devices)

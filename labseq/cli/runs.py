@@ -8,13 +8,16 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.console.report import Column, print_report, table
+from labseq.console.output import say
+from labseq.console.report import Column, aligned, print_report, table
+from labseq.console.runs import folder_of_run
 from labseq.console.text import plural, size_text
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.messages import visible
+from labseq.messages import clean, visible
 from labseq.recording import data_root
-from labseq.recording.folders import runs_in
 from labseq.recording.index import read_index
+from labseq.recording.listing import runs_in
+from labseq.recording.notes import Notes, read_notes, write_notes
 from labseq.recording.run_file import read_run, read_state
 
 
@@ -126,3 +129,25 @@ def _local_time(t_utc: Any) -> str:
         return f"{datetime.fromisoformat(t_utc).astimezone():%H:%M}"
     except (TypeError, ValueError, OverflowError):
         return "-"
+
+
+def write_note(path: Path, text: str | None, tags: Sequence[str], untag: Sequence[str]) -> None:
+    """Replace the note of a run unless it is None, add and remove tags, and print what it then has.
+
+    Raises:
+        ConfigError: There is no such run, it has no such tag, or a text is too long.
+        RecordingError: The run's folder cannot be written to.
+    """
+    folder = folder_of_run(path)
+    before = read_notes(folder)
+    if unknown := [tag for tag in untag if tag not in before.tags]:
+        expected = (
+            f"one of {', '.join(map(clean, before.tags))}" if before.tags else "none, as it has no tags"
+        )
+        raise ConfigError(Problem(f"the run has no tag '{clean(unknown[0])}'", "--untag", expected=expected))
+    kept = (tag for tag in before.tags if tag not in untag)
+    notes = Notes.of(before.comment if text is None else text, (*kept, *tags))
+    if notes != before:
+        write_notes(folder, notes)
+    tag_text = ", ".join(map(clean, notes.tags)) or "none"
+    say(*aligned([("run", clean(str(folder))), ("note", clean(notes.comment) or "none"), ("tags", tag_text)]))

@@ -12,10 +12,11 @@ from typing import TextIO
 from labseq.cli.live import observer_for
 from labseq.cli.summary import Summary
 from labseq.console.output import say
-from labseq.console.runs import folder_of_run, newest_run
+from labseq.console.runs import folder_of_run
 from labseq.data import open_run
 from labseq.data.follower import Follower
 from labseq.files import data_root
+from labseq.recording.listing import newest_run
 
 
 def watch_run(

@@ -167,6 +167,13 @@ Seed = Annotated[
 Output = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder for the data, instead of LABSEQ_DATA or ./data.")
 ]
+Note = Annotated[
+    str, typer.Option(metavar="TEXT", help="A note about the run, as labseq runs and the web page show it.")
+]
+Tags = Annotated[
+    list[str] | None,
+    typer.Option("--tag", metavar="TAG", help="A word to find the run by; may be given several times."),
+]
 Realtime = Annotated[bool, typer.Option("--realtime", help="Let a simulated run take as long as a real one.")]
 Workers = Annotated[
     int,

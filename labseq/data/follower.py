@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from labseq.data.shot import Shot, caching_loader
+from labseq.data.shot import CachingLoader, Shot
 from labseq.errors import RecordingError
 from labseq.files import NewLines
 from labseq.recording.folders import EVENTS_FILE, INDEX_FILE
@@ -49,7 +49,7 @@ class Follower:
         self._clock = clock
         self._index = NewLines(run_dir / INDEX_FILE)
         self._log = NewLines(run_dir / EVENTS_FILE)
-        self._load = caching_loader()
+        self._load = CachingLoader()
         self._taken = defaultdict[tuple[int, int, str], list[Shot]](list)
         self._logged_s = self._line_s = 0.0
         self._event_s, self._told_s = 0.0, clock()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from labseq.data.shot import Shot, caching_loader
+from labseq.data.shot import CachingLoader, Shot
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import read_lines
 from labseq.messages import clean
@@ -35,21 +35,24 @@ def open_run(path: str | Path) -> Run:
     Only the index is read. A shot's file is read when one of its values is needed.
 
     Args:
-        path: The run's folder or any file in it.
+        path: The run's folder or any file in it, or its name or number as ``labseq runs`` prints it:
+            "2026-11-20/0001_compact-225", "compact-225" or "75", of which it is the newest.
 
     Raises:
-        RecordingError: It is not a run, is damaged, or has another format.
+        RecordingError: There is no such run, or it is damaged, or has another format.
     """
     try:
         path = Path(path)
     except TypeError:
-        raise RecordingError(repr(path), "is not a path", "give a run's folder or a file in it") from None
+        raise RecordingError(
+            repr(path), "is not a path", "give a run's folder, name or number, as text"
+        ) from None
     folder = folders.find_run(path)
     record = read_run(folder)
     # the state before the index: if the run is complete by now, the index has all of its lines
     status, error = read_state(folder)
     rows, n_damaged = read_index(folder)
-    load = caching_loader()
+    load = CachingLoader()
     # of a shot that was written twice, the last line counts
     counted = {row.shot: row for row in rows if row.counts}
     return Run(
@@ -134,6 +137,20 @@ class Run:
         """Settings changed by ``--set`` and other options: address -> value, as it was typed."""
         overrides = dict(self.record.get("overrides") or {})
         return {address: str(change["written"]) for address, change in overrides.items()}
+
+    @property
+    def note(self) -> str:
+        """The note about the run, of the page or ``labseq note``; read from its file each time."""
+        from labseq.recording.notes import read_notes  # a run in progress does not need it
+
+        return read_notes(self.path).comment
+
+    @property
+    def tags(self) -> tuple[str, ...]:
+        """The tags of the run; read from their file each time."""
+        from labseq.recording.notes import read_notes
+
+        return read_notes(self.path).tags
 
     @property
     def scan(self) -> Mapping[str, Any]:

@@ -29,9 +29,18 @@ def load_content(path: Path) -> ShotContent:
     return read_content(path)
 
 
-def caching_loader() -> Callable[[Path], ShotContent]:
-    """A loader that keeps the last eight shots: several values of a shot then read its file once."""
-    return lru_cache(maxsize=8)(load_content)
+class CachingLoader:
+    """Reads shots' files and keeps the last eight: several values of a shot then read its file once."""
+
+    def __init__(self) -> None:
+        self._read = lru_cache(maxsize=8)(load_content)
+
+    def __call__(self, path: Path) -> ShotContent:
+        """The content of a shot's file."""
+        return self._read(path)
+
+    def __reduce__(self) -> tuple[type[CachingLoader], tuple[()]]:
+        return CachingLoader, ()  # another process reads the files itself
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

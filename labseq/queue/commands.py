@@ -8,6 +8,7 @@ import typer
 from labseq.console.options import (
     DryRun,
     Json,
+    Note,
     Output,
     Overrides,
     Plugins,
@@ -16,6 +17,7 @@ from labseq.console.options import (
     Seed,
     SequenceFile,
     Shots,
+    Tags,
     dry_run_mode,
 )
 from labseq.files import data_root
@@ -84,6 +86,8 @@ def add(
             show_default=False,
         ),
     ] = None,
+    note: Note = "",
+    tags: Tags = None,
     _plugins: Plugins = None,
 ) -> None:
     """Check a sequence and add it at the end of the queue.
@@ -93,9 +97,8 @@ def add(
     from labseq.assembly.options import Options
     from labseq.queue.running import add_entry, rules_from
 
-    options = Options(
-        profile, shots, seed, tuple(overrides or ()), output, dry_run_mode(dry_run), realtime=realtime
-    )
+    changes, dry_run_kind, given_tags = tuple(overrides or ()), dry_run_mode(dry_run), tuple(tags or ())
+    options = Options(profile, shots, seed, changes, output, dry_run_kind, realtime, note, given_tags)
     add_entry(sequence, options, rules_from(if_fails.value, until, needs or ()))
 
 

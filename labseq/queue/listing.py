@@ -123,10 +123,8 @@ def rule_texts(rules: Rules) -> list[str]:
     """The rules of an entry that differ from their defaults."""
     texts = [] if rules.if_fails == "stop" else [f"if-fails={rules.if_fails}"]
     texts += [f"until={local_time(rules.until_utc)}"] if rules.until_utc else []
-    return [
-        *texts,
-        *(f"needs {kind}={format_quantity(age_s, 'time')}" for kind, age_s in rules.needs.items()),
-    ]
+    needs = [f"needs {kind}, at most {age_text(age_s, ' old')}" for kind, age_s in rules.needs.items()]
+    return [*texts, *needs]
 
 
 ENTRIES: Final[Sequence[Column[EntryRow]]] = (

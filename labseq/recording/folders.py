@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from labseq.errors import RecordingError
-from labseq.files import explained, sync_folder
+from labseq.files import data_root, explained, is_there, sync_folder
 
 RUN_FILE: Final = "run.json"
 STATE_FILE: Final = "STATE"
@@ -28,7 +28,7 @@ STOP_FILE: Final = "STOP"
 NOTIFY_FILE: Final = "notify.yaml"
 """In the data folder: who is told of failures, alarms and the end of the queue."""
 NOTES_FILE: Final = "notes.json"
-"""Comment and tags, from `labseq web`; exists only if there are any."""
+"""Note and tags, see :mod:`labseq.recording.notes`; exists only if there are any."""
 LOCK_FILE: Final = ".lock"
 """Locked by the process that resumes or repairs the run."""
 
@@ -119,30 +119,24 @@ def _counters(day: Path, *, claims: bool = True) -> list[int]:
     return [int(match[1]) for match in matches if match]
 
 
-def runs_in(root: Path) -> list[Path]:
-    """The folders of runs in a data folder, damaged ones included, the newest last."""
-    run_dirs = [folder for folder in root.glob("*-*-*/*_*") if counter_of(folder) >= 0 and folder.is_dir()]
-    # by number, not by name: 10000 follows 9999
-    return sorted(run_dirs, key=lambda folder: (folder.parent.name, counter_of(folder)))
-
-
-def counter_of(folder: Path) -> int:
-    """The number of a run, from the name of its folder; -1 if it has none."""
-    number = folder.name.partition("_")[0]
-    return int(number) if number.isdecimal() else -1
-
-
 def find_run(path: Path) -> Path:
-    """Find the folder of the run that a path belongs to.
+    """Find the folder of a run.
+
+    Args:
+        path: The folder or any file in it; or the name or number of a run, see
+            :func:`labseq.recording.listing.named_run`.
 
     Raises:
-        RecordingError: The path is not part of a run; the message says what to give instead.
+        RecordingError: There is no such run; the message says what to give instead.
     """
-    path = Path(path).expanduser().resolve()
-    if not path.exists():
-        raise RecordingError(
-            path, "no such file or folder", "give a run's folder, <data>/<date>/<counter>_<name>"
-        )
+    try:
+        if not is_there(path.expanduser()):
+            from labseq.recording.listing import named_run  # a plain run does not need it
+
+            return named_run(path.as_posix(), data_root())
+    except OSError as error:
+        raise RecordingError(path, f"cannot be read: {str(error.strerror or error).lower()}") from error
+    path = path.expanduser().resolve()
     for folder in (path, path.parent, path.parent.parent):
         if (folder / RUN_FILE).is_file():
             return folder

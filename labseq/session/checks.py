@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from labseq.config.sequence import CheckSettings
-from labseq.data.shot import Shot, caching_loader
+from labseq.data.shot import CachingLoader, Shot
 from labseq.errors import CheckFailedError
 from labseq.model import TargetPattern
 from labseq.recording.index import IndexRow
@@ -51,7 +51,7 @@ class Checks:
         self._run_dir = run_dir
         self._analyses = analyses
         self._warn = warn
-        self._load = caching_loader()
+        self._load = CachingLoader()
         self._unseen = {check.value for check in checks if not check.value.startswith(PREFIX)}
         self.left_open = -1, ""
         for row in rows:

@@ -13,7 +13,7 @@ from labseq.assembly.assemble import Assembly
 from labseq.assembly.lab import build_lab, clock_for, warm
 from labseq.assembly.point import Point
 from labseq.data import Run, Shot
-from labseq.data.shot import caching_loader
+from labseq.data.shot import CachingLoader
 from labseq.guard import StopFlag
 from labseq.recording.index import IndexRow
 from labseq.roles import RunObserver
@@ -46,7 +46,7 @@ class History:
         self.shots = defaultdict[int, dict[int, Shot]](dict)
         self.given_up: dict[int, IndexRow] = {}
         self._is_scan, self._is_search = assembly.scanned is not None, assembly.search is not None
-        self._load = caching_loader()
+        self._load = CachingLoader()
         if run is not None and self._is_search:
             for shot in run.shots:
                 self.shots[self.point_of_shot[shot.index]][shot.index] = shot

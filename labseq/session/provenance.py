@@ -9,7 +9,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import distributions
 from pathlib import Path
@@ -25,6 +25,7 @@ from labseq.model import CalibrationEntry, RunRecord
 from labseq.model.records import RunStatus, unique_names
 from labseq.plain import now_utc
 from labseq.plugins.host import name_and_version
+from labseq.recording.folders import NOTES_FILE
 from labseq.settings import si_unit_at
 from labseq.units import si_unit_of
 
@@ -218,6 +219,19 @@ def _plugin_of_sequence(assembly: Assembly, loc: Loc) -> tuple[Entry | None, int
 def copies(calibrations: Mapping[str, CalibrationEntry]) -> dict[str, bytes | str]:
     """The active calibrations as files for the run's folder: file name -> content."""
     return {f"calibration_{kind}.json": encode_entry(entry) for kind, entry in calibrations.items()}
+
+
+def notes_file(note: str, tags: Sequence[str]) -> dict[str, bytes | str]:
+    """The note about a run and its tags as a file for the run's folder; {} without any.
+
+    Raises:
+        ConfigError: One is too long.
+    """
+    if not (note or tags):
+        return {}
+    from labseq.recording.notes import Notes
+
+    return {NOTES_FILE: Notes.of(note, tags).encoded()}
 
 
 def ending(error: BaseException | None) -> tuple[RunStatus, str]:

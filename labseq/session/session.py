@@ -31,7 +31,7 @@ from labseq.session.alarms import Alarms
 from labseq.session.check import check
 from labseq.session.checks import Checks
 from labseq.session.prepared import PreparedRun
-from labseq.session.provenance import copies, ending, run_record
+from labseq.session.provenance import copies, ending, notes_file, run_record
 from labseq.session.stopping import check_stop_file
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
@@ -165,6 +165,7 @@ class Session(PreparedRun):
         before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
         super().__init__(assembly, observer, paced=options.realtime, run=before, done=done)
         self.options = options
+        self._notes = notes_file(options.note, options.tags)
         self.earlier = earlier
         self.run_dir: Path | None = None
         # before devices are opened: some vendors' libraries change the working folder
@@ -183,6 +184,8 @@ class Session(PreparedRun):
         output: str | Path | None = None,
         dry_run: DryRun = "off",
         realtime: bool = False,
+        note: str = "",
+        tags: Sequence[str] = (),
         observer: RunObserver | None = None,
     ) -> Session:
         """Read and check sequence and profile; nothing is opened yet.
@@ -196,6 +199,8 @@ class Session(PreparedRun):
             output: Folder for the data.
             dry_run: "off", "full" or "fast".
             realtime: Let virtual time pass at the speed of real time.
+            note: A note about the run, for people; kept in its folder.
+            tags: Words to find the run by.
             observer: Receives every event.
 
         Raises:
@@ -204,7 +209,7 @@ class Session(PreparedRun):
             PluginLoadError: A plugin that is named failed to load.
         """
         folder = None if output is None else path_of(output, "output")
-        options = Options(profile, shots, seed, overrides, folder, dry_run, realtime)
+        options = Options(profile, shots, seed, overrides, folder, dry_run, realtime, note, tags)
         return cls(assemble(path_of(sequence, "sequence"), options), options, observer)
 
     @classmethod
@@ -404,7 +409,7 @@ class Session(PreparedRun):
         changes, earlier = self.options.changes(), self.earlier
         record = run_record(self.assembly, self.seed, changes, self._cwd)
         if earlier is None:
-            extra_files = copies(self.assembly.hardware.calibrations)
+            extra_files = copies(self.assembly.hardware.calibrations) | self._notes
             writer = RunWriter.create(root, record, extra_files, self.stop_flag)
         else:
             first_shot = None if first is None else self.history.to_take[0]

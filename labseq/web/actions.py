@@ -20,10 +20,11 @@ from labseq.errors import ConfigError, Problem
 from labseq.files import SEQUENCES, packaged_sequences_dir
 from labseq.messages import clean
 from labseq.queue.queue import Queue
+from labseq.recording.notes import Notes, write_notes
 from labseq.recording.run_file import read_state
 from labseq.session.stopping import ask_to_stop
 from labseq.web.endpoint import Endpoint, in_thread
-from labseq.web.runs import MAX_NOTE, Catalogue, NoSuchRun, text_of, write_notes
+from labseq.web.runs import Catalogue, NoSuchRun, text_of
 
 MAX_BODY: Final = 64 << 10
 CHECK_S: Final = 60.0
@@ -112,11 +113,11 @@ class Actions:
         values = await body_of(request)
         run = self._runs.open(request.path_params["day"], request.path_params["name"])
         comment, tags = values.get("comment", ""), values.get("tags", [])
-        if not isinstance(comment, str) or len(comment) > MAX_NOTE:
-            raise ConfigError(Problem("the comment is too long", expected=f"at most {MAX_NOTE} characters"))
+        if not isinstance(comment, str):
+            raise ConfigError(Problem("the comment is not a text"))
         if not isinstance(tags, list) or not all(isinstance(tag, str) for tag in tags):  # pyright: ignore[reportUnknownVariableType]
             raise ConfigError(Problem("the tags are not a list of texts"))
-        write_notes(run.folder, comment, tags)  # pyright: ignore[reportUnknownArgumentType]
+        write_notes(run.folder, Notes.of(comment, tags))  # pyright: ignore[reportUnknownArgumentType]
         return {"done": "saved"}
 
     async def add(self, request: Request) -> Any:

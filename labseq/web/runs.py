@@ -20,19 +20,16 @@ from labseq.data.points import reporting_damage
 from labseq.data.quantities import WITH_TARGET, make_quantity, names_measured, quantity_problem
 from labseq.data.series import Series
 from labseq.errors import RecordingError
-from labseq.files import read_file, write_file
 from labseq.messages import visible
 from labseq.model import TargetPattern
-from labseq.plain import dumps, now_utc, parse_object
-from labseq.recording.folders import INDEX_FILE, NOTES_FILE, RUN_FILE, STATE_FILE, runs_in
+from labseq.recording.folders import INDEX_FILE, NOTES_FILE, RUN_FILE, STATE_FILE
+from labseq.recording.listing import runs_in
+from labseq.recording.notes import read_notes
 from labseq.recording.run_file import read_run, read_state, target_of
 from labseq.web.history import RunHistory, judged_values
 
 MAX_TEXT: Final = 2000
 """Maximum number of characters of a text from a file that is passed on."""
-MAX_NOTE: Final = 10_000
-"""Maximum number of characters of a comment."""
-MAX_TAGS: Final = 20
 _LISTED_S: Final = 0.5
 """The list of folders is read again only after this time, in seconds."""
 _DAY: Final = re.compile(r"\d{4}-\d\d-\d\d")
@@ -314,7 +311,7 @@ def _matches(summary: Mapping[str, Any], words: Iterable[str]) -> bool:
 
 
 def _summary(run: OpenRun) -> dict[str, Any]:
-    values: dict[str, Any] = {"id": text_of(run.id, 300), **read_notes(run.folder)}
+    values: dict[str, Any] = {"id": text_of(run.id, 300), **notes_of(run.folder)}
     keys = ("name", "profile", "started_utc", "simulated", "n_shots", "n_done", "filling", "defect_free")
     values |= dict.fromkeys((*keys, "has_scan")) | {"measured": []}
     try:
@@ -349,26 +346,10 @@ def profile_of(record: Mapping[str, Any]) -> str:
     return text_of(name or Path(str(record.get("profile_path") or "")).stem or "-", 200)
 
 
-def read_notes(folder: Path) -> dict[str, Any]:
-    """Comment and tags of a run; empty if there are none or they are damaged."""
-    values: Mapping[str, Any] = {}
-    with suppress(RecordingError):
-        if (folder / NOTES_FILE).exists():
-            values = parse_object(read_file(folder / NOTES_FILE, 1 << 20)) or {}
-    tags: Any = values.get("tags")
-    listed = cast("list[Any]", tags)[:MAX_TAGS] if isinstance(tags, list) else []
+def notes_of(folder: Path) -> dict[str, Any]:
+    """Note and tags of a run, as the pages show them."""
+    notes = read_notes(folder)
     return {
-        "comment": text_of(values.get("comment") or "", MAX_NOTE),
-        "tags": [text_of(t, 60) for t in listed],
+        "comment": text_of(notes.comment, len(notes.comment)),
+        "tags": [text_of(tag) for tag in notes.tags],
     }
-
-
-def write_notes(folder: Path, comment: str, tags: list[str]) -> None:
-    """Replace comment and tags of a run.
-
-    Raises:
-        RecordingError: The folder cannot be written to.
-    """
-    tidied = dict.fromkeys(text for tag in tags if (text := " ".join(tag.split())[:60]))
-    values = {"comment": comment[:MAX_NOTE], "tags": list(tidied)[:MAX_TAGS], "t_utc": now_utc()}
-    write_file(folder / NOTES_FILE, dumps(values, indent=1).encode() + b"\n")

@@ -26,7 +26,7 @@ from labseq.plain import now
 from labseq.recording.folders import INDEX_FILE, STOP_FILE
 from labseq.recording.run_file import read_state
 from labseq.web.history import Columns, judged_values
-from labseq.web.runs import OpenRun, profile_of, read_notes, text_of
+from labseq.web.runs import OpenRun, notes_of, profile_of, text_of
 from labseq.web.scan import ScanView
 from labseq.web.series import finite
 from labseq.web.shots import rows_of, shot_values
@@ -242,7 +242,7 @@ def head_of(run: OpenRun, record: Mapping[str, Any], status: str, error: str) ->
             "n_atoms": target.n_atoms,
             "fill": rows_of(target.fill),
         },
-        **read_notes(run.folder),
+        **notes_of(run.folder),
     }
 
 

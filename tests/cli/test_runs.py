@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 
+import labseq
 from labseq.console.runs import folder_of_run
 from labseq.recording import RunWriter
+from labseq.recording.notes import Notes, write_notes
 
 DAYS = ("2026-01-02", "2026-01-03")
 
@@ -85,3 +87,16 @@ def test_a_name_of_no_run(data: Path, call: Any) -> None:
         assert (code, out) == (2, "")
         assert err.startswith("2026-01-04/1: ")
         assert "`labseq runs`" in err
+
+
+def test_note_and_tags_are_those_of_the_page(data: Path, call: Any) -> None:
+    folder = data / DAYS[1] / "10000_compact-225"
+    write_notes(folder, Notes.of("from the page", ["lens", "good"]))
+    code, out, err = call("note", "10000", "--tag", "new", "--untag", "lens")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[1:] == ["note  from the page", "tags  good, new"]
+    code, _, err = call("note", "10000", "--untag", "lens")
+    assert (code, err) == (2, "--untag: the run has no tag 'lens'; expected one of good, new\n")
+    assert call("note", "10000", "two\nlines")[0] == 0
+    run = labseq.open_run("10000")
+    assert (run.note, run.tags) == ("two\nlines", ("good", "new"))

@@ -14,11 +14,11 @@ from labseq.analysis.scanned import ScanRequest
 from labseq.cli.show import Tables, show_run
 from labseq.cli.summary import MAX_ROWS, Summary
 from labseq.console.report import aligned
-from labseq.console.runs import newest_run
 from labseq.data import open_run
 from labseq.errors import ConfigError
 from labseq.model import StageTiming
 from labseq.recording import RunWriter
+from labseq.recording.listing import newest_run
 
 NO_TERMINAL = pytest.mark.usefixtures("capsys")
 """Tables are as wide as the terminal."""
@@ -105,7 +105,7 @@ def test_show_finds_the_newest_run_itself(
     monkeypatch.setenv("LABSEQ_DATA", str(tmp_path))
     with pytest.raises(ConfigError, match="holds no runs"):
         show_run(None, as_json=True)
-    assert json.loads(capsys.readouterr().out)["error"].startswith(f"error: {tmp_path} holds no runs")
+    assert json.loads(capsys.readouterr().out)["error"].startswith(f"{tmp_path}: holds no runs")
     write_run(tmp_path, fake, [])
     folder = write_run(tmp_path, fake, [fake.shot(0)])
     show_run(None, as_json=True)

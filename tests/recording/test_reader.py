@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -217,7 +218,7 @@ def test_several_values_of_a_shot_read_its_file_once(run_dir: Path) -> None:
 
 @pytest.mark.parametrize("path", [None, b"data"])
 def test_what_is_no_path_is_no_run(path: Any) -> None:
-    with pytest.raises(RecordingError, match="is not a path; give a run's folder or a file in it"):
+    with pytest.raises(RecordingError, match="is not a path; give a run's folder, name or number"):
         open_run(path)
 
 
@@ -227,3 +228,9 @@ def test_only_shots_of_the_run_are_skipped(tmp_path: Path) -> None:
     with (writer.run_dir / "skipped.jsonl").open("a", encoding="utf-8") as file:
         file.write('{"shots": [0, 3], "why": ""}\n{"shots": [true], "why": ""}\n{"shots": 1}\n{"sho')
     assert open_run(writer.run_dir).skipped == {2: "no light"}
+
+
+def test_another_process_can_be_given_a_run_and_its_shots(run_dir: Path) -> None:
+    run = pickle.loads(pickle.dumps(open_run(run_dir).select("shot < 2")))
+    assert [shot.index for shot in run.shots] == [0, 1]
+    assert run.shots[1].images[0] is run.shots[1].images[0]  # the file is read once, as before
