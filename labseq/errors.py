@@ -382,6 +382,7 @@ class AlarmError(LabseqError):
 
     Attributes:
         alarm: Its name in the profile, for example "atoms".
+        text: What it says.
         n_shots: Number of shots in a row.
     """
 
@@ -389,9 +390,11 @@ class AlarmError(LabseqError):
 
     def __init__(self, alarm: str, text: str, n_shots: int) -> None:
         self.alarm = alarm
+        self.text = text
         self.n_shots = n_shots
         hint = "its limit is 'alarms' in the profile"
-        super().__init__(f"alarm '{alarm}' in {n_shots} shots in a row ({hint}): {text}")
+        shots = "1 shot" if n_shots == 1 else f"{n_shots} shots in a row"
+        super().__init__(f"alarm '{alarm}' in {shots} ({hint}): {text}")
 
 
 class StopRequested(LabseqError):  # noqa: N818 - a request, not an error

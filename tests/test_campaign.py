@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,6 @@ import pytest
 from labseq.analysis.campaigns import campaign_picture, combined
 from labseq.campaigns.campaign import Campaign, PlannedRun, recorded_runs
 from labseq.campaigns.certificates import make_certificates
-from labseq.campaigns.commands import run_file
 from labseq.campaigns.running import run_at_once, run_in_turn
 from labseq.cli import main
 from labseq.cluster import ClusterWorkers
@@ -237,20 +234,54 @@ def test_a_cluster_takes_the_runs_where_it_sees_the_folder(file: Path) -> None:
     assert [run.status for run in all_runs(folder)] == ["complete"] * 4
 
 
-def test_the_table_has_the_mean_filling_of_the_shots_that_have_one(
-    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+NO_ATOMS = """labseq: 1
+sequence: loading.yaml
+axes:
+  profile.simulation.loading: [0 %, 80 %]
+  profile.alarms.stop_after: [2]
+repeats: REPEATS
+seed: 3
+"""
+LOADING = """labseq: 1
+name: loading
+profile: ./p.yaml
+shot:
+  - load: {duration: 500 ms}
+  - image: {exposure: 45 ms}
+"""
+
+
+@pytest.mark.parametrize(("repeats", "status"), [(4, "failed"), (6, "complete")])
+def test_an_alarm_ends_its_run_and_not_the_campaign(
+    file: Path, capsys: pytest.CaptureFixture[str], repeats: int, status: str
 ) -> None:
-    fillings = [[0.5, math.nan, 1.0], [0.9], [math.nan], []]
-    runs = [
-        [SimpleNamespace(path=Path(f"day/{n}"), shots=[SimpleNamespace(filling_fraction=one) for one in own])]
-        for n, own in enumerate(fillings)
-    ]
-    recorded = dict(zip(Campaign.read(file).points(), runs, strict=True))
-    monkeypatch.setattr("labseq.campaigns.campaign.recorded_runs", lambda _: (None, recorded))
-    run_file(lambda *_, **__: None, file, file.parent / "out", 1, None, None)
-    rows = [line for line in capsys.readouterr().out.splitlines() if "day/" in line]
-    assert [row.split("%")[1].split()[-2:] for row in rows[:2]] == [["3", "75.00"], ["1", "90.00"]]
-    assert all(" - " in row for row in rows[2:])
+    """The alarm begins with the third shot: only then 100 sites have been looked at."""
+    (file.parent / "loading.yaml").write_text(LOADING, encoding="utf-8")
+    file.write_text(NO_ATOMS.replace("REPEATS", str(repeats)), encoding="utf-8")
+    folder = file.parent / "out"
+    command = ["campaign", "run", str(file), "--output", str(folder)]
+    assert left_with(*command) == 3
+    out, err = capsys.readouterr()
+    table = [line.split() for line in out.splitlines()[-4:-1]]
+    assert table[0][2:] == ["shots", "loading", "runs"]
+    assert [row[3:5] for row in table[1:]] == [["4", "0"], [str(repeats), table[2][4]]]
+    assert "alarm 'atoms' in 2 shots in a row" in err
+    assert "in all, alarms ended 1 of 2 runs" in err
+    # one that has all its shots is over; the shots that are left are taken now
+    assert left_with(*command) == 0
+    dark = all_runs(folder)[0]
+    assert (dark.status, len(dark.shots)) == (status, repeats)
+    assert "alarm 'atoms'" in str([dark.error, dark.record["resumed"]])
+    if status == "failed":
+        with pytest.raises(ConfigError, match=r"no shot is missing, and its end stays on record: .*'atoms'"):
+            Session.resume(dark.path)
+
+
+def left_with(*arguments: str) -> Any:
+    """The exit code of a command."""
+    with pytest.raises(SystemExit) as left:
+        main(arguments)
+    return left.value.code or 0
 
 
 @pytest.mark.parametrize(

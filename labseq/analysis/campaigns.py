@@ -1,4 +1,4 @@
-"""The runs of a campaign together: one file, one picture."""
+"""The runs of a campaign together: one file, one picture, and what each point measures."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq.analysis.overview import RunPicture, scan_panels
+from labseq.analysis.scanned import title_of, value_text
 from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, Point, recorded_runs
 from labseq.console.output import say
 from labseq.console.text import plural
@@ -175,6 +176,13 @@ def campaign_picture(folder: Path) -> RunPicture:
         raise ConfigError(Problem("the campaign has no shots to draw yet", visible(str(folder))))
     note = "; ".join([plural(sum(map(len, shots)), "shot"), *_missing(campaign, runs)])
     return RunPicture(f"campaign {clean(folder.resolve().name)}", note, rows)
+
+
+def results_of(runs: Sequence[Run]) -> dict[str, str]:
+    """What some runs of one sequence measure: name -> mean over their shots, as text; empty without runs."""
+    quantities = [_over_runs({(): runs}, name) for name in measured_by(runs[0])] if runs else []
+    shots = _shots(runs)
+    return {title_of(one): value_text(one.over(shots), one, short=True) for one in quantities}
 
 
 def _over_runs(runs: Runs, name: str) -> Quantity:

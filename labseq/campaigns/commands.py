@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -54,6 +53,7 @@ def run_file(
     n_workers: int,
     scheduler: str | None,
     cluster_keys: Path | None,
+    results_of: Callable[[Sequence[Run]], Mapping[str, str]],
 ) -> None:
     """Take the runs of a campaign file, and print a table.
 
@@ -64,6 +64,10 @@ def run_file(
         n_workers: Number of runs at a time, each by a process of its own.
         scheduler: Address of a dask cluster that takes them instead.
         cluster_keys: Folder of its certificates.
+        results_of: Some runs -> what they measure: name -> mean, as text.
+
+    Raises:
+        AlarmError: Alarms ended some of the runs.
     """
     from labseq.campaigns.campaign import Campaign, recorded_runs
     from labseq.campaigns.running import run_at_once, run_in_turn
@@ -71,38 +75,53 @@ def run_file(
     from labseq.console.output import say
     from labseq.console.report import aligned
     from labseq.console.text import plural
+    from labseq.errors import AlarmError
     from labseq.workers import ProcessWorkers
 
     check_workers(None if n_workers == 1 else n_workers, scheduler)
     wanted = Campaign.read(file)
+    report = _reporter(wanted, results_of)
     if scheduler is not None:
-        run_at_once(wanted, folder, ClusterWorkers(scheduler, cluster_keys, "run"), _reporter(wanted))
+        alarms = run_at_once(wanted, folder, ClusterWorkers(scheduler, cluster_keys, "run"), report)
     elif n_workers > 1:
-        run_at_once(wanted, folder, ProcessWorkers(n_workers, "run"), _reporter(wanted))
+        alarms = run_at_once(wanted, folder, ProcessWorkers(n_workers, "run"), report)
     else:
-        run_in_turn(run_session, wanted, folder)
+        alarms = run_in_turn(run_session, wanted, folder)
     _, runs = recorded_runs(folder)
-    rows: list[tuple[Any, ...]] = [(*wanted.axes, "shots", "filling", "runs")]
-    rows += [(*wanted.values(point), *_result(runs[point])) for point in wanted.points()]
-    say("", *aligned(rows), f"{plural(sum(map(len, runs.values())), 'run')} in {folder}")
+    results = {point: results_of(runs[point]) for point in wanted.points()}
+    names = [*dict.fromkeys(name for means in results.values() for name in means)]
+    rows: list[tuple[str, ...]] = [(*wanted.axes, "shots", *names, "runs")]
+    for point, means in results.items():
+        measured = [means.get(name, "-") for name in names]
+        rows.append((*wanted.values(point), _n_shots(runs[point]), *measured, _names(runs[point])))
+    n_runs = plural(sum(map(len, runs.values())), "run")
+    say("", *aligned(rows), f"{n_runs} in {folder}")
+    if alarms:
+        text = f"{alarms[0].text}; in all, alarms ended {len(alarms)} of {n_runs}, the others went on"
+        raise AlarmError(alarms[0].alarm, text, alarms[0].n_shots)
 
 
-def _reporter(wanted: Campaign) -> Callable[[PlannedRun, Run], None]:
-    """Prints a line for each run that is complete."""
+def _reporter(
+    wanted: Campaign, results_of: Callable[[Sequence[Run]], Mapping[str, str]]
+) -> Callable[[PlannedRun, Run], None]:
+    """Prints a line for each run that is over."""
     from labseq.console.output import say
 
     def report(planned: PlannedRun, run: Run) -> None:
         at = ", ".join(f"{a} = {v}" for a, v in zip(wanted.axes, wanted.values(planned.point), strict=True))
-        n_shots, filling, name = _result([run])
-        say(": ".join(filter(None, [name, at, f"{n_shots} shots, filling {filling}"])))
+        means = [f"{name} {mean}" for name, mean in results_of([run]).items()]
+        ended = [] if run.status == "complete" else [f"{run.status}: {run.error}"]
+        results = ", ".join([f"{_n_shots([run])} shots", *means, *ended])
+        say(": ".join(filter(None, [_names([run]), at, results])))
 
     return report
 
 
-def _result(runs: list[Run]) -> tuple[str, str, str]:
-    """Number of shots, mean filling, and names of some runs."""
-    shots = [shot for run in runs for shot in run.shots]
-    fillings = [filling for shot in shots if not math.isnan(filling := shot.filling_fraction)]
-    mean = f"{100 * sum(fillings) / len(fillings):.2f} %" if fillings else "-"
-    first, *others = (f"{run.path.parent.name}/{run.path.name}" for run in runs)
-    return str(len(shots)), mean, f"{first} to {others[-1]}" if others else first
+def _n_shots(runs: Sequence[Run]) -> str:
+    return str(sum(len(run.shots) for run in runs))
+
+
+def _names(runs: Sequence[Run]) -> str:
+    """The names of some runs: of the first, and of the last."""
+    names = [f"{run.path.parent.name}/{run.path.name}" for run in runs]
+    return " to ".join(dict.fromkeys([*names[:1], *names[-1:]]))

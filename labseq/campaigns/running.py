@@ -12,15 +12,16 @@ from typing import Any, TypeAlias
 from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, PlannedRun, Point, run_folders
 from labseq.config.document import Document
 from labseq.data import Run, open_run
-from labseq.errors import ConfigError, LabseqError, Problem
+from labseq.errors import AlarmError, ConfigError, LabseqError, Problem
 from labseq.files import explained, write_file
 from labseq.guard import StopFlag, stop_on_signals
 from labseq.messages import clean, visible
 from labseq.processes import Lock
 from labseq.recording.folders import LOCK_FILE
-from labseq.recording.run_file import read_owner, read_state, sha256_of_text
+from labseq.recording.run_file import read_owner, sha256_of_text
 from labseq.roles import RunObserver
 from labseq.session.provenance import plugins_of
+from labseq.session.resume import is_over
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop, is_running
 from labseq.workers import POLL_S, Workers, portable
@@ -117,13 +118,13 @@ def _missing(campaign: Campaign, folder: Path, inputs: CampaignInputs) -> Missin
             what = "this run was taken with another text of the sequence or the profile"
             expected, hint = "another folder", "or the files as they were, which are in the run's folder"
             raise ConfigError(Problem(what, visible(str(run.path)), expected=expected, hint=hint))
-        if (key not in best or best[key].status != "complete") and not _is_elsewhere(run.path):
+        if (key not in best or not is_over(best[key])) and not _is_elsewhere(run.path):
             best[key] = run
     _copy_file(campaign, folder, is_new=not best)
     return [
         (run, best[key].path if key in best else None)
         for key, run in planned.items()
-        if key not in best or best[key].status != "complete"
+        if key not in best or not is_over(best[key])
     ]
 
 
@@ -162,20 +163,28 @@ def open_session(
     return Session.open(campaign.sequence, **asdict(replace(run.options, output=folder)), observer=observer)
 
 
-def run_in_turn(run_session: RunSession, campaign: Campaign, folder: Path) -> None:
+def run_in_turn(run_session: RunSession, campaign: Campaign, folder: Path) -> list[AlarmError]:
     """Take the missing runs of a campaign one after the other.
+
+    Returns:
+        The alarms that ended runs: the others may well have atoms.
 
     Raises:
         ConfigError: The campaign has an error, or the runs in the folder belong to another one.
         LabseqError: A run failed; the same command continues the campaign.
     """
+    alarms: list[AlarmError] = []
     with campaign_folder(campaign, folder, check_campaign(campaign, in_turn=True)) as missing:
         for run, earlier in missing:
 
             def start(observer: RunObserver | None, run: Any = run, earlier: Any = earlier) -> Session:
                 return open_session(campaign, run, folder, earlier, observer)
 
-            run_session(start)
+            try:
+                run_session(start)
+            except AlarmError as alarm:
+                alarms.append(alarm)
+    return alarms
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,22 +241,26 @@ class RunTaker:
     def _earlier(self, run: PlannedRun) -> Path | None:
         """The folder of a run that was started here before: by a worker that died, or an earlier command."""
         for path in reversed(run_folders(self._task.folder)):
-            is_open = read_state(path)[0] != "complete" and not _is_elsewhere(path)
-            if is_open and open_run(path).changes == run.options.changes():
+            earlier = open_run(path)
+            is_open = not is_over(earlier) and not _is_elsewhere(path)
+            if is_open and earlier.changes == run.options.changes():
                 return path
         return None
 
 
 def run_at_once(
     campaign: Campaign, folder: Path, workers: Workers, report: Callable[[PlannedRun, Run], None]
-) -> None:
+) -> list[AlarmError]:
     """Take the missing runs of a campaign, one per worker at a time.
 
     If a worker dies, another one resumes its run.
 
     Args:
         workers: The workers; closed at the end.
-        report: Called with each run that is complete.
+        report: Called with each run that is complete, or was ended by an alarm.
+
+    Returns:
+        The alarms that ended runs: the others may well have atoms.
 
     Raises:
         ConfigError: The campaign has an error, or the runs in the folder belong to another one.
@@ -265,7 +278,7 @@ def run_at_once(
             task = WorkerTask(document.path.resolve(), document.text, folder.resolve(), inputs.plugins)
             workers.prepare(RunTaker, task)
             try:
-                _share_out(remaining, workers, report, stop)
+                return _share_out(remaining, workers, report, stop)
             finally:
                 # also those on other computers, which no signal reaches
                 for path in filter(is_running, run_folders(folder) if remaining else ()):
@@ -277,17 +290,20 @@ def _share_out(
     workers: Workers,
     report: Callable[[PlannedRun, Run], None],
     stop: StopFlag,
-) -> None:
-    """Give each worker one run at a time, and remove complete runs from ``remaining``."""
-    waiting, n_out = iter([*remaining]), 0
+) -> list[AlarmError]:
+    """Give each worker one run at a time, and remove runs that are over from ``remaining``."""
+    waiting, n_out, alarms = iter([*remaining]), 0, list[AlarmError]()
     while remaining:
         while n_out < workers.n_workers and (number := next(waiting, None)) is not None:
             workers.submit(number, number)
             n_out += 1
         stop.check()
         for number, (run_dir, error) in workers.finished(POLL_S):
-            if error is not None:
+            if isinstance(error, AlarmError):
+                alarms.append(error)
+            elif error is not None:
                 stop.check()  # Ctrl-C reaches the workers too: their errors are no failures then
                 raise error
             report(remaining.pop(number), open_run(run_dir))
             n_out -= 1
+    return alarms

@@ -255,7 +255,7 @@ def run_campaign(
 
     The same command continues a campaign that was stopped.
     """
-    from labseq.analysis.campaigns import export_campaign
+    from labseq.analysis.campaigns import export_campaign, results_of
     from labseq.campaigns.commands import run_file
     from labseq.cli.run import run_session
     from labseq.console.output import check_writable
@@ -265,7 +265,7 @@ def run_campaign(
     if netcdf is not None:  # before the first run
         check_installed("xarray", "h5netcdf")
         check_writable(netcdf)
-    run_file(partial(run_session, as_json=False), file, folder, workers, scheduler, keys)
+    run_file(partial(run_session, as_json=False), file, folder, workers, scheduler, keys, results_of)
     if netcdf is not None:
         export_campaign(folder, netcdf)
 

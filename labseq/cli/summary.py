@@ -29,7 +29,7 @@ from labseq.data.follower import Follower
 from labseq.data.quantities import WITH_TARGET, WITHOUT_TARGET, Quantity, measured_by, quantity_of
 from labseq.data.scanned import scanned
 from labseq.errors import StopRequested
-from labseq.messages import clean
+from labseq.messages import clean, one_line
 from labseq.model.estimate import Estimate, Estimated, mean
 from labseq.units import format_quantity
 from labseq.watchdog import watchdog_lines
@@ -75,6 +75,7 @@ class Summary:
         best: The best point of an adaptive scan.
         wall_time_s: Time until the end of the last shot; of a resumed run, of all its parts together.
         watchdog: What the watchdog did.
+        resumed: Where it was resumed, and how it had ended before.
         n_damaged_lines: Lines of the index that cannot be read.
     """
 
@@ -97,6 +98,7 @@ class Summary:
     best: BestPoint | None = None
     wall_time_s: float = math.nan
     watchdog: Sequence[str] = ()
+    resumed: Sequence[str] = ()
     n_damaged_lines: int = 0
 
     @classmethod
@@ -123,6 +125,7 @@ class Summary:
             best=best_point(run),
             wall_time_s=_wall_time_s(run),
             watchdog=watchdog_lines(run.path),
+            resumed=_resumed(run),
             n_damaged_lines=run.n_damaged_lines,
         )
 
@@ -141,7 +144,7 @@ class Summary:
     def as_text(self) -> list[str]:
         """A table of the points or cycles, and the statistics."""
         tables = self.scan.table(MAX_ROWS) if self.scan else cycle_table(self.statistics)
-        ended_early = self.status in ("stopped", "failed")
+        ended_early = self.status in ("stopped", "failed") and self.shots + self.skipped < self.n_shots
         resume = (
             [f"resume it with: labseq resume {quoted(self.run_dir)}"] if self.run_dir and ended_early else []
         )
@@ -162,6 +165,7 @@ class Summary:
             *((clean(name), value) for name, value in self.results),
             ("wall time", _wall_time(self.wall_time_s)),
             *(("watchdog", clean(line)) for line in self.watchdog),
+            *(("resumed", line) for line in self.resumed),
             *([("warning", damaged)] if self.n_damaged_lines else []),
         ]
 
@@ -175,6 +179,16 @@ def _best_rows(best: BestPoint | None) -> Facts:
     suggested = ", ".join(f"{clean(address)} {value}" for address, value in best.suggested.items())
     source = "a parabola through the points near it" if best.is_fitted else "no parabola fits: the best point"
     return [("best point", f"{at}: {value}"), ("suggested", f"{suggested} ({source})")]
+
+
+def _resumed(run: Run) -> list[str]:
+    """A line for each time that a run was resumed; runs of earlier versions do not tell how they ended."""
+    entries: Any = run.record.get("resumed") or ()
+    return [
+        f"at shot {entry.get('first_shot')}, after it had {one_line(str(entry.get('before', 'ended early')))}"
+        for entry in entries
+        if isinstance(entry, dict)
+    ]
 
 
 def _n_atoms(run: Run) -> list[Estimate]:

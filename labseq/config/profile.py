@@ -293,27 +293,30 @@ class AlarmSettings(Settings):
     )
     frozen: bool = Field(default=True, description="whether two equal frames after one another are an alarm")
     atoms: Fraction = Field(
-        default=0.02, description="least share of the sites with an atom on the first image; 0: no alarm"
+        default=0.02,
+        description="least share of the sites with an atom on the first image, over as many shots as have "
+        "100 sites together; 0: no alarm",
     )
     full: int = Field(
-        default=25,
+        default=100,
         ge=0,
-        description="from this number of sites on, an atom on every site of the first image is an alarm; "
-        "0: no alarm",
+        description="this many sites, all with an atom on the first image, of one shot or of several in a "
+        "row, are an alarm; 0: no alarm",
     )
     loading: Fraction = Field(
         default=0.5,
         description="least number of loaded atoms, relative to the mean of the last 10 to 20 shots with the "
-        "same settings; 0: no alarm",
+        "same settings, where it is also 5 standard deviations below; 0: no alarm",
     )
     confidence: Fraction = Field(
         default=0.99,
-        description="least confidence of the detector, on average over the sites of an image; 0: no alarm",
+        description="least confidence of the detector, on average over the sites of an image, over as many "
+        "shots as have 1,000 sites together; 0: no alarm",
     )
     arrived: Fraction = Field(
         default=0.1,
-        description="least share of the atoms moved by the first cycle, of 10 or more, that the next image "
-        "shows where they were moved; 0: no alarm",
+        description="least share of the atoms moved by the first cycle that the next image shows where they "
+        "were moved, over as many shots as have 100 of them together; 0: no alarm",
     )
     clock: Duration = Field(
         default=10.0, description="largest jump of the computer's clock between two shots"

@@ -303,8 +303,9 @@ class RunRecord:
         scan: What was scanned: "addresses", "points", "point_of_shot", ...; empty without a scan.
         calibrations: Those in use: kind -> id.
         steps: Names of the steps, in order; each is unique.
-        resumed: How it was resumed after it had ended early, in order: ``t_utc``, ``first_shot``,
-            ``changes`` that were accepted (each ``what``, ``was`` and ``now``) and ``provenance``.
+        resumed: How it was resumed after it had ended early, in order: ``t_utc``, ``first_shot``, how it had
+            ended (``before``), ``changes`` that were accepted (each ``what``, ``was`` and ``now``) and
+            ``provenance``.
     """
 
     name: str

@@ -6,8 +6,9 @@ Each alarm warns when it begins; after some shots in a row it ends the run, so t
 
 from __future__ import annotations
 
+import math
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Final
@@ -25,8 +26,39 @@ COMPARED: Final = 20
 """Maximum number of earlier shots whose loading a shot is compared with."""
 LEAST_COMPARED: Final = 10
 """Minimum number: the mean of fewer is too uncertain."""
-LEAST_MOVED: Final = 10
-"""Minimum number of atoms that a cycle moves to judge whether they arrived."""
+SIGMAS: Final = 5.0
+"""How far a loading must be below its mean, in standard deviations: few sites often load half of the mean."""
+LEAST_ATOMS: Final = 100
+"""Minimum number of sites, or of moved atoms, to judge a share by: those of few occur by chance."""
+LEAST_CONFIDENCES: Final = 1000
+"""The same for the confidence, which a few doubtful sites decide."""
+
+
+class Latest:
+    """A share of sites or atoms, over as few of the latest shots as have enough of them together.
+
+    Args:
+        least: The number that is enough.
+    """
+
+    def __init__(self, least: int) -> None:
+        self._least = least
+        self._counts = deque[tuple[float, int]](maxlen=least)
+        self.n: float = 0
+        self.n_of = 0
+
+    def add(self, n: float, n_of: int) -> float:
+        """Add a shot; returns the share, or nan as long as there are not enough."""
+        self._counts.append((n, n_of))
+        while sum(count[1] for count in self._counts) - self._counts[0][1] >= self._least:
+            self._counts.popleft()
+        self.n, self.n_of = sum(n for n, _ in self._counts), sum(n_of for _, n_of in self._counts)
+        return self.n / self.n_of if self.n_of >= self._least else math.nan
+
+    @property
+    def shots(self) -> str:
+        """Which shots they are of, if they are not of the last one alone."""
+        return f", in the last {len(self._counts)} shots" if len(self._counts) > 1 else ""
 
 
 class Alarms:
@@ -54,7 +86,10 @@ class Alarms:
         self._in_a_row: dict[str, int] = {}
         self._texts: dict[str, str] = {}
         self._frame: NDArray[np.uint16] | None = None
-        self._loadings: dict[str, deque[int]] = {}
+        self._loadings = defaultdict[str, deque[int]](lambda: deque(maxlen=COMPARED))
+        self._atoms, self._full = Latest(LEAST_ATOMS), Latest(self._settings.full)
+        self._confidences = defaultdict[int, Latest](lambda: Latest(LEAST_CONFIDENCES))
+        self._arrived = Latest(LEAST_ATOMS)
 
     def look(self, shot: ShotRecord) -> None:
         """Look at a shot that was taken; attempts that did not complete are left out."""
@@ -109,24 +144,29 @@ class Alarms:
         if not shot.images:
             return
         occupancy, settings = shot.images[0].occupancy, self._settings
-        n_atoms = int(np.count_nonzero(occupancy))
-        if n_atoms < settings.atoms * occupancy.size:
-            what = f"{_atoms(n_atoms)} on the first image, at {occupancy.size} sites"
+        n_atoms, n_sites = int(np.count_nonzero(occupancy)), occupancy.size
+        if (atoms := self._atoms).add(n_atoms, n_sites) < settings.atoms:
+            what = f"{_atoms(atoms.n)} on the first image, at {atoms.n_of} sites{atoms.shots}"
             yield "atoms", f"{what}; check the source of atoms, the tweezers and the camera"
-        if settings.full and n_atoms == occupancy.size >= settings.full:
-            what = f"all {n_atoms} sites are full on the first image"
+        if settings.full and self._full.add(n_atoms, n_sites) == 1.0:
+            what = f"all {self._full.n} sites are full on the first image{self._full.shots}"
             yield "full", f"{what}; check the thresholds and the light"
-        others = self._loadings.setdefault(repr(shot.parameters), deque[int](maxlen=COMPARED))
-        if len(others) >= LEAST_COMPARED and n_atoms < settings.loading * (mean := float(np.mean(others))):
-            yield "loading", f"{_atoms(n_atoms)} loaded, {mean:.3g} on average in the shots before"
+        others = self._loadings[repr(shot.parameters)]
+        if len(others) >= LEAST_COMPARED:
+            mean = float(np.mean(others))
+            least = mean - SIGMAS * math.sqrt(mean * (1.0 - mean / n_sites))
+            if n_atoms < min(settings.loading * mean, least):
+                yield "loading", f"{_atoms(n_atoms)} loaded, {mean:.3g} on average in the shots before"
+                return  # shots after a failure are compared with those before it
         others.append(n_atoms)
 
     def _detection(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
-        confidences = [float(np.nanmean(image.confidence)) for image in shot.images if image.cycle < 0]
-        lowest = min(confidences, default=1.0)
-        if lowest < self._settings.confidence:
-            what = f"by its own account the detector is right at only {100 * lowest:.3g} % of the sites"
-            yield "confidence", f"{what}; do the thresholds fit the gain and the exposure?"
+        images = [image for image in shot.images if image.cycle < 0]
+        sums = [(image.step, np.nan_to_num(image.confidence, nan=1.0)) for image in images]
+        shares = [self._confidences[step].add(one.sum(), one.size) for step, one in sums]
+        if low := [share for share in shares if share < self._settings.confidence]:
+            what = f"the detector's confidence is only {100 * min(low):.3g} % on average over the sites"
+            yield "confidence", f"{what}; do its thresholds and its width fit the gain and the exposure?"
 
     def _moves(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
         """Whether the atoms that the first cycle moved are seen where it moved them."""
@@ -134,9 +174,9 @@ class Alarms:
             cycle = shot.cycles[0]
             if (after.step, after.cycle) == (cycle.step, cycle.cycle):
                 moved, _ = follow_atoms(before.occupancy, [cycle])
-                n_moved, n_seen = np.count_nonzero(moved), np.count_nonzero(moved & after.occupancy)
-                if n_moved >= LEAST_MOVED and n_seen < self._settings.arrived * n_moved:
-                    what = f"{n_seen} of {n_moved} moved atoms arrived"
+                n_moved, n_seen = int(moved.sum()), int((moved & after.occupancy).sum())
+                if (arrived := self._arrived).add(n_seen, n_moved) < self._settings.arrived:
+                    what = f"{arrived.n} of {arrived.n_of} moved atoms arrived{arrived.shots}"
                     yield "arrived", f"{what}; check light, trigger and overlay of the mobile tweezers"
 
     def _clock(self) -> Iterator[tuple[str, str]]:
@@ -148,5 +188,5 @@ class Alarms:
             yield "clock", f"{what}: it was set, or the computer slept"
 
 
-def _atoms(n: int) -> str:
+def _atoms(n: float) -> str:
     return f"{n} atom{'s' * (n != 1)}"

@@ -24,7 +24,7 @@ from labseq.processes import Lock, knows_no_locks
 from labseq.recording import RunWriter
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, RUN_FILE, find_run
 from labseq.recording.index import IndexRow
-from labseq.recording.run_file import SCANNER, encode_run, read_owner, read_run, read_state
+from labseq.recording.run_file import SCANNER, encode_run, read_owner, read_run, read_state, read_state_file
 from labseq.session.provenance import run_record
 from labseq.text_files import decode, read_bytes
 
@@ -99,12 +99,9 @@ class ResumableRun:
         LineLog(folder / INDEX_FILE)  # ends an unfinished last line: if it is whole, its shot counts
         run = open_run(folder)
         gone = [shot.index for shot in run.shots if not shot.file.is_file()]
+        if (over := is_over(run)) and not gone:
+            raise _refused(folder, over)
         done = frozenset(shot.index for shot in run.shots).difference(gone).union(run.skipped)
-        ended = (
-            SCANNER in (run.record.get("scan") or {}) and not gone
-        )  # the scanner ended the run before all shots were taken
-        if run.status == "complete" and (ended or len(done) >= run.n_shots):
-            raise _refused(folder, "it is complete: no shot is missing")
         if gone:
             warnings.append(
                 f"the files of these shots are gone, and the shots are taken again: {_numbers(gone)}"
@@ -174,12 +171,27 @@ class ResumableRun:
         """
         resumed = tuple(self.run.record.get("resumed") or ())
         if first_shot is not None:
-            entry = {"t_utc": now_utc(), "first_shot": first_shot}
+            before = ": ".join(filter(None, [self.run.status, self.run.error]))
+            entry = {"t_utc": now_utc(), "first_shot": first_shot, "before": before}
             changes = [change._asdict() for change in self.changes]
             resumed += ({**entry, "changes": changes, "provenance": record.provenance},)
         then = str(self.run.record["t_start_utc"])
         record = replace(record, t_start_utc=then, resumed=resumed)
         return RunWriter.reopen(self.run.path, record, n_written=len(self.rows), stop=stop)
+
+
+def is_over(run: Run) -> str:
+    """Why there is nothing left to do in a run; "" if it can be resumed."""
+    # of a run that has failed after its last shot, resuming it would hide the reason; one whose process is
+    # gone, or that was stopped, has yet to be ended
+    failed = read_state_file(run.path).get("state") == "failed"
+    # a scanner ends a run before all shots are taken
+    ended = run.status == "complete" and SCANNER in (run.record.get("scan") or {})
+    if not ended and len({*run.skipped, *(shot.index for shot in run.shots)}) < run.n_shots:
+        return ""
+    if failed:
+        return f"no shot is missing, and its end stays on record: {run.error}"
+    return "it is complete: no shot is missing" if run.status == "complete" else ""
 
 
 def _refused(folder: Path, why: str) -> ConfigError:

@@ -18,15 +18,15 @@ from labseq.testing.fakes import RecordingObserver
 from .whole_runs import SMALL_FRAMES
 
 RNG = np.random.default_rng(7)
-SHAPE = (6, 6)
+SHAPE = (40, 40)
 
 
 def frame(noise: float = 5.0) -> np.ndarray[Any, Any]:
     return RNG.normal(500.0, noise, (40, 40)).astype(np.uint16)
 
 
-def image(n_atoms: int = 27, confidence: float = 1.0, counts: Any = None) -> ImageRecord:
-    occupancy = (np.arange(36) < n_atoms).reshape(SHAPE)
+def image(n_atoms: int = 1200, confidence: float = 1.0, counts: Any = None) -> ImageRecord:
+    occupancy = (np.arange(1600) < n_atoms).reshape(SHAPE)
     pixels = Frame(frame() if counts is None else counts, 0.01, 0.0)
     return ImageRecord(pixels, occupancy, np.full(SHAPE, confidence, np.float32), 1, -1, 0.0, 0.01)
 
@@ -56,7 +56,7 @@ class Watched:
         (image(counts=np.full((40, 40), 65535, np.uint16)), ["saturated"]),
         (image(counts=np.minimum(frame(50.0), 550)), ["saturated"]),
         (image(0), ["atoms"]),
-        (image(36), ["full"]),
+        (image(1600), ["full"]),
         (image(confidence=0.98), ["confidence"]),
     ],
 )
@@ -75,12 +75,36 @@ def test_an_old_frame_is_an_alarm() -> None:
 
 
 def test_a_loading_far_below_its_mean_is_an_alarm() -> None:
-    watched = Watched()
-    for n_atoms in (27, 24, 29, 26, 25, 28, 27, 26, 30):
+    watched = Watched(stop_after=12)
+    for n_atoms in (1200, 1180, 1220, 1210, 1190, 1230, 1200, 1170, 1200):
         assert watched.shot(image(n_atoms)) == []
-    assert watched.shot(image(13)) == []  # nine shots are too few to compare with
-    assert watched.shot(image(12)) == ["loading"]
-    assert watched.shot(image(14)) == []
+    assert watched.shot(image(590)) == []  # nine shots are too few to compare with
+    assert watched.shot(image(560)) == ["loading"]
+    assert watched.shot(image(580)) == []
+    for _ in range(12):  # the mean is that of the shots before the failure, however long it lasts
+        watched.shot(image(400))
+    with pytest.raises(AlarmError, match=r"'loading' in 12 shots in a row"):
+        watched.alarms.raise_if_lasting()
+
+
+@pytest.mark.parametrize(("n_sites", "loading"), [(1, 0.5), (9, 0.3), (25, 0.9), (100, 0.75), (400, 0.2)])
+def test_chance_alone_gives_no_alarm_in_a_thousand_shots(n_sites: int, loading: float) -> None:
+    watched, rng = Watched(), np.random.default_rng(3)
+    for n_shot in range(1000):
+        occupancy = rng.random((1, n_sites)) < loading
+        # the doubt of a detector that is right at 99.9 % of the sites
+        doubt = np.where(rng.random((1, n_sites)) < 4e-3, rng.random((1, n_sites)), 0.0).astype(np.float32)
+        seen = ImageRecord(None, occupancy, 1 - doubt, 1, -1, 0.0, 0.01)
+        assert watched.shot(seen) == [], n_shot
+
+
+def test_few_sites_are_judged_over_several_shots() -> None:
+    dark = ImageRecord(None, np.zeros((3, 3), bool), np.zeros((3, 3), np.float32), 1, -1, 0.0, 0.01)
+    watched = Watched()
+    began = [watched.shot(dark) for _ in range(112)]
+    assert (began[11], began[111]) == (["atoms"], ["confidence"])
+    assert began.count([]) == 110
+    assert "0 atoms on the first image, at 108 sites, in the last 12 shots" in watched.warnings[0]
 
 
 def test_a_clock_that_jumps_is_an_alarm() -> None:
@@ -109,7 +133,7 @@ def test_an_alarm_warns_once_and_ends_the_run_after_some_shots_in_a_row() -> Non
 def test_every_limit_can_be_switched_off() -> None:
     off: dict[str, Any] = {"saturated": 1, "frozen": False, "atoms": 0, "full": 0, "confidence": 0}
     watched, pixels = Watched(**off), np.full((40, 40), 65535, np.uint16)
-    assert watched.shot(image(0, 0.5, pixels), image(36, 0.5, pixels)) == []
+    assert watched.shot(image(0, 0.5, pixels), image(1600, 0.5, pixels)) == []
 
 
 def run(tmp_path: Path, n_shots: int, *overrides: str) -> tuple[list[str], BaseException | None, Path]:
