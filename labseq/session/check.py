@@ -470,9 +470,15 @@ def _window_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
             what = f"a window of {format_quantity(shortest, 'time')} is over before the first batch is"
             yield number, document.problem(loc, what, "more than the overheads of a cycle and a batch")
     loaded = next(iter(rehearsals.values()))
-    if loaded.n_filled < 0.9 * loaded.n_loadings:
-        what = f"only {loaded.n_filled} of {loaded.n_loadings} loadings have enough atoms for the target"
+    if loaded.n_enough < 0.9 * loaded.n_loadings:
+        what = f"only {loaded.n_enough} of {loaded.n_loadings} loadings have enough atoms for the target"
         yield -1, document.problem(("target",), what, "a smaller target, or better loading")
+    if loaded.n_filled < 0.9 * loaded.n_enough:
+        name = point_check.point.planner.entry.name
+        what = f"the planner '{name}' fills the target for only {loaded.n_filled} of the {loaded.n_enough} "
+        what += "loadings that have enough atoms"
+        loc = (*point_check.checks.run.assembly.sequence.planner.loc, "use")
+        yield -2, document.problem(loc, what, "a planner that leaves fewer defects")
 
 
 def _light_warnings(assembly: Assembly, lab: Lab) -> Iterator[Problem]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,18 +25,28 @@ N_PROGRAMS: Final = 5
 """Number of plans whose tones are computed."""
 
 
+class FirstCycle(NamedTuple):
+    """The first cycle of a rearrangement: its plan, what that does, and whether there were enough atoms."""
+
+    plan: Plan
+    report: PlanReport
+    has_enough: bool
+
+
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
     """The planner's results for random loadings.
 
     Attributes:
         n_loadings: Number of loadings.
-        n_filled: Number of loadings with enough atoms and a plan that fills the target.
+        n_enough: Number of loadings with enough atoms for the target.
+        n_filled: Number of loadings with a plan that fills the target.
         duration_s: float64 (n_loadings,), from the start of a cycle to the end of its last batch.
         first_batch_s: float64 (n_loadings,), the same for its first batch.
     """
 
     n_loadings: int
+    n_enough: int
     n_filled: int
     duration_s: NDArray[np.float64]
     first_batch_s: NDArray[np.float64]
@@ -69,8 +79,8 @@ def rehearse(
     loading = None if lab.simulation is None else lab.simulation.loading_probability
     if loading is None:
         loading = PAPERS_LOADING
-    shots: list[list[tuple[Plan, PlanReport]]] = []
-    cycles: list[tuple[Plan, PlanReport]] = []
+    shots: list[list[FirstCycle]] = []
+    cycles: list[FirstCycle] = []
 
     def plan() -> None:
         """All in one guarded call, because handing each plan over to a thread takes longer than planning."""
@@ -90,15 +100,15 @@ def rehearse(
         what = f"it fails on a random loading of {100 * loading:.0f} % (seed {seed}): {error}"
         # only the first plan is made for the loading itself
         failure = Problem(what, hint="" if cycles else f"see it with: labseq plan {drawn} --seed {seed}")
-    plans = [plan for shot in shots for plan, _ in shot if plan.n_batches][:N_PROGRAMS]
-    rehearsals = [_summary([report for _, report in cycles]) for cycles in zip(*shots, strict=True)]
+    plans = [cycle.plan for shot in shots for cycle in shot if cycle.plan.n_batches][:N_PROGRAMS]
+    rehearsals = [_summary(first_cycles) for first_cycles in zip(*shots, strict=True)]
     return rehearsals, plans, failure
 
 
 def _first_cycles(
     lab: Lab, windows: Sequence[Sequence[float]], loading: float, seed: int
-) -> Iterator[tuple[Plan, PlanReport]]:
-    """Plan and report of the first cycle of each rearrangement, which begins where the one before ends."""
+) -> Iterator[FirstCycle]:
+    """The first cycle of each rearrangement, which begins where the one before ends."""
     rng = np.random.default_rng(seed)
     occupancy = rng.random(lab.grid.shape) < loading
 
@@ -111,7 +121,7 @@ def _first_cycles(
             plan = lab.planner.plan(occupancy.copy(), lab.target)
             report = checked(plan)
             if cycle == 0:
-                yield plan, report
+                yield FirstCycle(plan, report, int(occupancy.sum()) >= lab.target.n_atoms)
             if number == len(windows) - 1:
                 break
             n_played = fitting_batches(report, plan, window_s)
@@ -121,10 +131,12 @@ def _first_cycles(
                 break
 
 
-def _summary(reports: Sequence[PlanReport]) -> Rehearsal:
+def _summary(cycles: Sequence[FirstCycle]) -> Rehearsal:
+    reports = [cycle.report for cycle in cycles]
     durations = np.array([report.duration_s for report in reports])
     firsts = np.array(
         [float(report.batch_end_s[0]) if len(report.batch_end_s) else 0.0 for report in reports]
     )
+    n_enough = sum(cycle.has_enough for cycle in cycles)
     n_met = sum(report.meets_target for report in reports)
-    return Rehearsal(len(reports), n_met, durations, firsts)
+    return Rehearsal(len(reports), n_enough, n_met, durations, firsts)
