@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from labseq.console.report import aligned
 from labseq.console.text import count_of
@@ -13,6 +13,7 @@ from labseq.data import Run
 from labseq.data.columns import Column, make_column
 from labseq.data.fits import Fit
 from labseq.data.points import ScanPoint
+from labseq.data.precision import follows
 from labseq.data.quantities import (
     Quantity,
     description_of,
@@ -26,9 +27,6 @@ from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.units import UNITS, dimension_of, readable_unit
-
-MAX_CHI_SQUARE: Final = 4.0
-"""Reduced chi-square above which the summary warns: errors are then too small by a factor of 2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +237,7 @@ def _aim(run: Run) -> tuple[str, ...]:
 
 def _doubt(fit: Fit) -> str:
     """What a value's error does not tell: that the points do not follow the model."""
-    if fit.reduced_chi_square <= MAX_CHI_SQUARE or math.isnan(fit.reduced_chi_square):
+    if follows(fit) or math.isnan(fit.reduced_chi_square):
         return ""
     return f" (reduced chi-square {fit.reduced_chi_square:.2g}: the points do not follow the model)"
 

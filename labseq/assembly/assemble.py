@@ -192,7 +192,7 @@ def _assembled(
     analyses, results = make_analyses(hardware, document, sequence, problems)
     target = objects.get("target")
     policy = make_policy(document, sequence, steps, results, target, problems)
-    measures = make_measures(document, sequence, steps, target, results, problems)
+    measures = make_measures(document, sequence, steps, target, results, scan, hardware.host, problems)
     scanned: ScanPoints | None = None
     search: Search | None = None
     try:

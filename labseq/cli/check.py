@@ -295,7 +295,9 @@ def _measure(measure: Mapping[str, Any]) -> str:
     if "fit" not in measure:
         return clean(measure["value"])
     result = f", result {measure['report']}" if "report" in measure else ""
-    return f"{clean(measure['value'])}, fit {measure['fit']}{result}"
+    stops = (f"{clean(name)} {clean(str(error))}" for name, error in measure.get("stop_when", {}).items())
+    stop = f", ends when known to {', '.join(stops)}" if "stop_when" in measure else ""
+    return f"{clean(measure['value'])}, fit {measure['fit']}{result}{stop}"
 
 
 def _calibration(entry: CalibrationEntry) -> str:

@@ -63,6 +63,7 @@ class Summary:
         filling_fraction: Mean filling of the target.
         status: "complete", "stopped", "failed" or "running".
         error: Why it failed.
+        ended_early: Why it is complete before its last shot.
         statistics: Results of the shots.
         n_shots: Number of shots that were asked for.
         skipped_shots: Why shots were skipped, each reason with its shots.
@@ -86,6 +87,7 @@ class Summary:
     filling_fraction: float = math.nan
     status: str = "failed"
     error: str | None = None
+    ended_early: str = ""
     statistics: Statistics | None = None
     n_shots: int = 0
     skipped_shots: Sequence[SkippedShots] = ()
@@ -113,6 +115,7 @@ class Summary:
             filling_fraction=run.filling_fraction,
             status=run.status,
             error=run.error or None,
+            ended_early=run.ended_early,
             statistics=statistics_of(run.shots, run.target),
             n_shots=run.n_shots,
             skipped_shots=_by_reason(run),
@@ -158,6 +161,7 @@ class Summary:
             ("run", str(self.run_dir)),
             ("status", f"failed: {self.error}" if self.error and self.status == "failed" else self.status),
             ("shots", f"{self.shots} of {self.n_shots}{skipped}{kept}"),
+            *([("ended early", clean(self.ended_early))] if self.ended_early else []),
             *_skipped_rows(self.skipped_shots),
             *_best_rows(self.best),
             *(statistics_rows(self.statistics) if self.has_target else _atom_rows(self.n_atoms)),

@@ -79,10 +79,15 @@ class MeasureSettings(Settings):
     parameters: Annotated[dict[str, int | float | str], empty_is({})] = Field(
         default={}, description="parameters of the fit that are fixed: `{offset: 0}`; `free` frees one"
     )
+    stop_when: Annotated[dict[str, int | float | str], empty_is({})] = Field(
+        default={},
+        description="errors of parameters at which the run ends before its last shot: "
+        "`{decay: 2 %}` of its value, or `{decay: 0.5 s}`",
+    )
 
     @model_validator(mode="after")
     def _has_a_fit(self) -> Self:
-        for key in ("report", "parameters"):
+        for key in ("report", "parameters", "stop_when"):
             if self.fit is None and getattr(self, key):
                 raise setting_error(f"'{key}' without a fit", "'fit' as well", at=(key,), key=True)
         return self

@@ -21,6 +21,7 @@ LASTING: Final = frozenset(
         "compiling",
         "compiled",
         "warning",
+        "ended_early",
         "run_starting",
         "shot_repeated",
         "safe_state",
@@ -94,12 +95,19 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
             return f"shot {values['shot']}: waiting for '{signal}' from {who}, at most {longest}"
         case "scan_point":
             return point_text(values)
-        case "scan_ended":
-            return f"{values['scanner']} has converged"
+        case "scan_ended" | "ended_early":
+            return ended_text(values)
         case "device_command":
             return f"shot {values['shot']}: {values['device']}: {values['command']}"
         case _:
             return FIXED.get(name, "")
+
+
+def ended_text(values: Mapping[str, Any]) -> str:
+    """A line about a run that ends before its last shot: its scanner or its fits have what they need."""
+    if "scanner" in values:
+        return f"{values['scanner']} has converged"
+    return f"{values['why']}; {plural(values['n_left'], 'shot')} left out"
 
 
 def window_text(values: Mapping[str, Any]) -> str:

@@ -177,7 +177,7 @@ def fit_points(
     points, fixed = _points(x, values), _fixed(model, given or {}, settings or {})
     points, solution = _solve_determined(model, points, fixed, {*(given or {})})
     parameters = {
-        name: Parameter(value.value, value.error, _unit_of(model.units.get(name, ""), *units))
+        name: Parameter(value.value, value.error, parameter_unit(model.units.get(name, ""), *units))
         for name, value in solution.values.items()
     }
     return Fit(
@@ -252,8 +252,14 @@ def _check_number(model: Model, points: Points, fixed: Mapping[str, float]) -> N
         raise _problem(problem, f"at least {len(free) + 1} different values with a result")
 
 
-def _unit_of(unit: str, x_unit: str, y_unit: str) -> str:
-    """The SI unit of a parameter, with "%" for a fraction."""
+def parameter_unit(unit: str, x_unit: str, y_unit: str) -> str:
+    """The SI unit of a parameter, with "%" for a fraction.
+
+    Args:
+        unit: Its unit as the model has it, see :class:`labseq.data.fit_models.FitModel`.
+        x_unit: SI unit of the scanned value.
+        y_unit: SI unit of the quantity; "%" for a fraction.
+    """
     numerator, _, denominator = unit.partition("/")
     top = {"x": x_unit, "y": y_unit}.get(numerator, numerator)
     if not denominator or not x_unit:

@@ -112,15 +112,25 @@ def find_lab_model(run: Run, name: str) -> LabModel:
     host.load_entry_points()
     host.load_folders(_plugin_folders(run))
     try:
-        entry = host.get("fit", name)
+        return lab_model_of(host, name)
     except UnknownPluginError as error:
         known = [*MODELS, *error.known]
         hint = did_you_mean(name, known) or error.hint
         problem = f"there is no fit '{clean(name)}'"
         raise ConfigError(Problem(problem, "--fit", expected=one_of(known), hint=hint)) from error
     except PluginLoadError as error:
-        raise ConfigError(Problem(str(error), "--fit")) from error
-    return _called(entry, lambda: _made(entry))
+        raise _fault(error) from error
+
+
+def lab_model_of(host: PluginHost, name: str) -> LabModel:
+    """A model that one of the loaded plugins offers.
+
+    Raises:
+        UnknownPluginError: None does.
+        PluginLoadError: Its plugin is at fault.
+    """
+    entry = host.get("fit", name)
+    return call_plugin(entry.owner, f"fit '{name}'", lambda: _made(entry))
 
 
 def _made(entry: Entry) -> LabModel:
@@ -158,4 +168,8 @@ def _called(entry: Entry, work: Callable[[], T]) -> T:
     try:
         return call_plugin(entry.owner, f"fit '{entry.name}'", work)
     except PluginLoadError as error:
-        raise ConfigError(Problem(f"plugin '{error.plugin}': {error.reason}", "--fit")) from error
+        raise _fault(error) from error
+
+
+def _fault(error: PluginLoadError) -> ConfigError:
+    return ConfigError(Problem(f"plugin '{error.plugin}': {error.reason}", "--fit"))

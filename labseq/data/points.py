@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,6 +110,18 @@ class ScanPoint:
     shots: tuple[Shot, ...]
 
 
+def planned_points(scan: Mapping[str, Any]) -> list[ScanPoint]:
+    """All points in a scan's record, in its order, without their shots."""
+    return [
+        ScanPoint(
+            dict(zip(scan["addresses"], values, strict=True)),
+            dict(zip(scan["addresses"], written, strict=True)),
+            (),
+        )
+        for values, written in zip(scan["points"], scan["written"], strict=True)
+    ]
+
+
 def scan_points(run: Run) -> list[ScanPoint]:
     """The points of a run's scan that have a shot, in the order of the scan; empty without one.
 
@@ -123,12 +135,5 @@ def scan_points(run: Run) -> list[ScanPoint]:
     with reporting_damage(run.path):
         for shot in run.shots:
             shots.setdefault(int(scan["point_of_shot"][shot.index]), []).append(shot)
-        addresses = scan["addresses"]
-        return [
-            ScanPoint(
-                dict(zip(addresses, scan["points"][point], strict=True)),
-                dict(zip(addresses, scan["written"][point], strict=True)),
-                tuple(shots[point]),
-            )
-            for point in sorted(shots)
-        ]
+        points = planned_points(scan)
+        return [replace(points[number], shots=tuple(shots[number])) for number in sorted(shots)]

@@ -18,7 +18,7 @@ from labseq.model.records import RunStatus
 from labseq.plain import to_plain
 from labseq.recording import folders
 from labseq.recording.index import read_index
-from labseq.recording.run_file import SCANNER, is_skip_row, read_run, read_state, target_of
+from labseq.recording.run_file import SCANNER, is_skip_row, read_run, read_state, read_state_file, target_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -168,6 +168,11 @@ class Run:
 
         with reporting_damage(self.path):
             return completed(scan, [shot.row for shot in (*self.shots, *self.attempts)])
+
+    @property
+    def ended_early(self) -> str:
+        """Why it is complete before its last shot, as ``stop_when`` of its sequence asked; or ""."""
+        return str(read_state_file(self.path).get("ended_early") or "")
 
     @property
     def defect_free(self) -> float:

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model.estimate import Estimated
 from labseq.units import dimension_of, factor_of, scaled, si_unit_of, split_quantity
+
+if TYPE_CHECKING:
+    from labseq.data.lab_models import LabModel
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +83,20 @@ def scanned(run: Run) -> Scanned | None:
     Raises:
         RecordingError: The scan in run.json is damaged.
     """
-    points = scan_points(run)
+    return on_axes(run.scan, scan_points(run))
+
+
+def on_axes(scan: Mapping[str, Any], points: Sequence[ScanPoint]) -> Scanned | None:
+    """Points of a scan on its axes; None without any.
+
+    Args:
+        scan: The scan's record in run.json.
+        points: Some of its points.
+    """
     if not points or not points[0].parameters:  # --set may have replaced every address
         return None
-    rows = [tuple(map(clean, row)) for row in run.scan["written"]]
-    columns, values = list(zip(*rows, strict=True)), list(zip(*run.scan["points"], strict=True))
+    rows = [tuple(map(clean, row)) for row in scan["written"]]
+    columns, values = list(zip(*rows, strict=True)), list(zip(*scan["points"], strict=True))
     numbers = [_numbers(*pair) for pair in zip(values, columns, strict=True)]
     addresses = list(map(clean, points[0].written))
     # an axis at least, even if all points have the same value
@@ -154,16 +166,18 @@ class FitRequest:
         model: Name of the model.
         given: Parameter -> its value, with a unit if it is text, at which it is fixed; or "free".
         along: Scanned address to fit along; None for the first axis.
+        lab_model: The model, if a plugin offers it that is loaded already.
     """
 
     model: str
     given: Mapping[str, str | float]
     along: str | None = None
+    lab_model: LabModel | None = None
 
 
-def request_of(measure: Mapping[str, Any]) -> FitRequest:
+def request_of(measure: Mapping[str, Any], lab_model: LabModel | None = None) -> FitRequest:
     """The fit of an entry of ``measure`` that has one, see :func:`labseq.data.quantities.measures_of`."""
-    return FitRequest(measure["fit"], measure.get("parameters") or {})
+    return FitRequest(measure["fit"], measure.get("parameters") or {}, lab_model=lab_model)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,8 +252,8 @@ def fitter(
         ConfigError: There is no such model.
     """
     profile: Mapping[str, Any] = (run.record.get("resolved") or {}).get("profile") or {}
-    lab_model = None
-    if request.model not in MODELS:
+    lab_model = request.lab_model
+    if lab_model is None and request.model not in MODELS:
         from labseq.data.lab_models import find_lab_model  # loading plugins takes a while
 
         lab_model = find_lab_model(run, request.model)

@@ -142,9 +142,10 @@ def _grid(rows: list[str]) -> NDArray[np.bool_]:
     return np.array([[site == "1" for site in row] for row in rows], np.bool_).reshape(len(rows), -1)
 
 
-def encode_state(status: RunStatus, error: str = "") -> bytes:
+def encode_state(status: RunStatus, error: str = "", ended_early: str = "") -> bytes:
     """The content of STATE: one line with the status, and the process that runs the run."""
-    return dumps({"state": status, **asdict(Process.current()), "error": error}).encode() + b"\n"
+    ends = {"error": error, "ended_early": ended_early}
+    return dumps({"state": status, **asdict(Process.current()), **ends}).encode() + b"\n"
 
 
 def read_state_file(folder: Path) -> dict[str, Any]:

@@ -51,6 +51,7 @@ class RunWriter:
         run_dir: The run's folder.
         run: The run's record, of which each shot has a copy.
         n_written: Shots written that count; failed attempts do not count.
+        ended_early: Why the run is complete before its last shot, or "".
         is_given_up: Whether the disk did not answer, so that nothing more is written.
     """
 
@@ -59,6 +60,7 @@ class RunWriter:
         self._guard = Guard(stop)
         self.is_given_up = False
         self.n_written = 0
+        self.ended_early = ""
         self._last_row: IndexRow | None = None
         self.run = run
         self._encoder = self._make_encoder()
@@ -290,7 +292,7 @@ class RunWriter:
             (self.run_dir / folders.STOP_FILE).unlink(missing_ok=True)
         # the state comes last: a reader that sees it finds all other lines
         self.event("run_finished", status=status, error=error, n_shots=self.n_written)
-        write_file(self.run_dir / folders.STATE_FILE, encode_state(status, error))
+        write_file(self.run_dir / folders.STATE_FILE, encode_state(status, error, self.ended_early))
 
 
 def run_id_of(run_dir: Path) -> str:

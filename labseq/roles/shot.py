@@ -473,6 +473,8 @@ EVENTS: Final = {
     "scan_point": "a shot of an adaptive scan is on disk: the point so far, and the best one",
     "scan_ended": "the scanner chose no further point",
     "scan_result": "an adaptive scan is over: the best point, its value with error, and the suggested values",
+    "ended_early": "the fits are as precise as `stop_when` asks, and the run ends: the parameters, and the "
+    "number of shots that are left",
     "warning": "something that the user should know; the run continues",
     "left_on": "the static tweezers stay on after the run",
     "safe_state": "a device was brought to its safe state, or could not be",

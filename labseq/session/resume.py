@@ -185,13 +185,14 @@ def is_over(run: Run) -> str:
     # of a run that has failed after its last shot, resuming it would hide the reason; one whose process is
     # gone, or that was stopped, has yet to be ended
     failed = read_state_file(run.path).get("state") == "failed"
-    # a scanner ends a run before all shots are taken
-    ended = run.status == "complete" and SCANNER in (run.record.get("scan") or {})
+    # a scanner, or `stop_when`, may end a run before all shots are taken
+    is_scanner = SCANNER in (run.record.get("scan") or {})
+    ended = run.status == "complete" and (is_scanner or bool(run.ended_early))
     if not ended and len({*run.skipped, *(shot.index for shot in run.shots)}) < run.n_shots:
         return ""
     if failed:
         return f"no shot is missing, and its end stays on record: {run.error}"
-    return "it is complete: no shot is missing" if run.status == "complete" else ""
+    return f"it is complete: {run.ended_early or 'no shot is missing'}" if run.status == "complete" else ""
 
 
 def _refused(folder: Path, why: str) -> ConfigError:

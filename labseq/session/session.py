@@ -36,6 +36,7 @@ from labseq.session.stopping import check_stop_file
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
 if TYPE_CHECKING:
+    from labseq.session.precision import Precision
     from labseq.session.resume import ResumableRun
 
 
@@ -96,11 +97,12 @@ class Shots:
         self._alarms.look(shot)
         return row
 
-    def take_all(self, checks: Checks) -> None:
-        """Take the shots until none is left, or the points end.
+    def take_all(self, checks: Checks, precision: Precision | None) -> None:
+        """Take the shots until none is left, the points end, or the fits are precise enough.
 
         Args:
             checks: Checks each shot; may end the run, or skip the other shots of a point.
+            precision: Judges the fits; None if the run takes all its shots.
 
         Raises:
             StopRequested: The run was asked to end.
@@ -122,6 +124,11 @@ class Shots:
             if why := failure or checks.after(self._writer.last_row):
                 self._skip([*([shot] if failure else []), *history.later_at_its_point(shot)], why)
             self._alarms.raise_if_lasting()
+            if precision is not None and (why := precision.after(self._writer.last_row)):
+                if history.to_take:
+                    self._writer.ended_early = why
+                    self._run.observers.event("ended_early", {"why": why, "n_left": len(history.to_take)})
+                return
 
     def _move_to(self, point: Point) -> None:
         """Change what differs between the present point and the next."""
@@ -329,7 +336,16 @@ class Session(PreparedRun):
             self._analyses_finished(writer),
             self._devices(shots.sequencer, record, writer),
         ):
-            shots.take_all(Checks(settings, writer.run_dir, before, target, self.analyses, self.warn))
+            checks = Checks(settings, writer.run_dir, before, target, self.analyses, self.warn)
+            shots.take_all(checks, self._precision(writer.run_dir, before))
+
+    def _precision(self, run_dir: Path, before: Sequence[IndexRow]) -> Precision | None:
+        """What ends the run early; None if its sequence does not ask for it."""
+        if not any("stop_when" in measure for measure in self.assembly.resolved["measure"]):
+            return None
+        from labseq.session.precision import Precision  # loads what other runs do not need
+
+        return Precision(self.assembly, run_dir, before, self.stop_flag, self.warn)
 
     @contextmanager
     def _folder(

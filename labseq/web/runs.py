@@ -35,7 +35,7 @@ _LISTED_S: Final = 0.5
 _DAY: Final = re.compile(r"\d{4}-\d\d-\d\d")
 _LISTED_EVENTS: Final = frozenset(
     {"warning", "safe_state", "closed", "shot_repeated", "window_too_short", "window_exceeded"}
-    | {"scan_ended", "leader_awaited", "left_on", "run_finished", "run_starting"}
+    | {"scan_ended", "ended_early", "leader_awaited", "left_on", "run_finished", "run_starting"}
 )
 """Events that the page lists."""
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import labseq
+from labseq.data.follower import Follower
 from labseq.data.quantities import measured_by
 from labseq.errors import ConfigError
 
@@ -111,3 +112,101 @@ def test_a_fit_has_the_parameters_of_its_model(tmp_path: Path, measure: str, exp
 def test_a_fit_needs_a_scan(tmp_path: Path) -> None:
     text = HEAD + "measure: [{value: loading, fit: exponential}]\n" + SURVIVAL
     assert "there is no scan along which to fit; expected 'scan'" in message(tmp_path, text)
+
+
+SCANNED = HEAD.replace("shots: 2\n", "repeats: 40\norder: shuffled\n") + SCAN.replace("2 s]", "9 s, 60 s]")
+
+
+@pytest.mark.parametrize(
+    ("measure", "expected"),
+    [
+        ("stop_when: {tau: 2 %}", "7:59: the model 'exponential' has no parameter 'tau'; expected one of"),
+        (
+            "stop_when: {decay: 2}",
+            "7:66: '2' has no unit; expected the error to reach: 2 % of the value, or 0.1 s",
+        ),
+        ("stop_when: {decay: 2 mV}", "7:66: '2 mV' does not have the unit of the parameter"),
+        ("stop_when: {decay: 0 %}", "7:66: '0 %' is not an error"),
+        ("stop_when: {offset: 2 %}", "7:59: 'offset' is fixed"),
+    ],
+)
+def test_an_error_to_reach_is_one_of_a_fitted_parameter(tmp_path: Path, measure: str, expected: str) -> None:
+    text = SCANNED + "measure: [{value: survival, fit: exponential, " + measure + "}]\n" + SURVIVAL
+    assert expected in message(tmp_path, text).replace(";  ", "; ")
+
+
+def test_a_run_that_takes_point_after_point_cannot_end_early(tmp_path: Path) -> None:
+    text = SCANNED.replace("order: shuffled\n", "")
+    text += "measure: [{value: survival, fit: exponential, stop_when: {decay: 2 %}}]\n" + SURVIVAL
+    assert "the run cannot end early: it takes all shots of a point" in message(tmp_path, text)
+
+
+def test_a_scan_of_names_cannot_be_fitted(tmp_path: Path) -> None:
+    scan = "scan: {shot.1.image.correct_overlay: [false, true]}\n"
+    text = SCANNED.replace(SCANNED[SCANNED.index("scan:") :], scan)
+    text += "measure: [{value: survival, fit: exponential}]\n" + SURVIVAL
+    assert "there is nothing to fit along" in message(tmp_path, text)
+
+
+FITS = """
+import lmfit
+import numpy as np
+from labseq.plugin import hookimpl
+
+LABSEQ_API = 1
+
+
+def decays(t, life=20.0):
+    return np.exp(-t / life)
+
+
+def raises(t, life=20.0):
+    return t / life["s"]
+
+
+@hookimpl
+def labseq_register(registry):
+    registry.fit("own", lambda: lmfit.Model(decays), {"life": "x"})
+    registry.fit("broken", lambda: lmfit.Model(raises), {"life": "x"})
+"""
+
+
+@pytest.mark.parametrize(("fit", "name"), [("exponential", "decay"), ("own", "life")])
+def test_a_run_ends_when_its_result_is_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fit: str, name: str
+) -> None:
+    (tmp_path / "fits.py").write_text(FITS, "utf-8")
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
+    measure = f"measure: [{{value: survival, fit: {fit}, stop_when: {{{name}: 5 %}}}}]\n"
+    with opened(tmp_path, SCANNED + measure + SURVIVAL) as session:
+        run = session.run()
+    assert run.status == "complete"
+    assert 6 <= len(run.shots) < 120
+    assert len(run.shots) % 3 == 0
+    parameter = run.fit("survival", fit).parameters[name]
+    assert run.ended_early == f"stop_when reached: {name} {parameter}"
+    assert parameter.error <= 0.05 * parameter.value
+    before = run.select(f"shot < {len(run.shots) - 3}").fit("survival", fit)
+    value = before.parameters[name]
+    assert value.error > 0.05 * value.value or before.reduced_chi_square > 4
+    with pytest.raises(ConfigError, match="the run cannot be resumed: it is complete: stop_when reached"):
+        labseq.Session.resume(run.path)
+
+
+@pytest.mark.parametrize(("fit", "warning"), [("linear", ""), ("broken", "raised TypeError")])
+def test_points_that_do_not_follow_or_a_broken_model_do_not_end_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fit: str, warning: str
+) -> None:
+    (tmp_path / "fits.py").write_text(FITS, "utf-8")
+    monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
+    name = {"linear": "slope", "broken": "life"}[fit]
+    limit = {"linear": "50 %", "broken": "50 %"}[fit]
+    measure = f"measure: [{{value: survival, fit: {fit}, stop_when: {{{name}: {limit}}}}}]\n"
+    text = SCANNED.replace("repeats: 40", "repeats: 3") + measure + SURVIVAL
+    with opened(tmp_path, text) as session:
+        run = session.run()
+    assert (len(run.shots), run.ended_early) == (9, "")
+    warnings = [event.values["text"] for event in Follower(run.path).log() if event.name == "warning"]
+    assert sum("the run takes all its shots" in text and warning in text for text in warnings) == bool(
+        warning
+    )

@@ -1,0 +1,63 @@
+"""How well a fitted parameter is to be known: an error relative to its value, or in its unit."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+from labseq.data.fits import Fit, Parameter
+from labseq.messages import clean
+from labseq.units import dimension_of, parse_any, split_quantity
+
+MAX_CHI_SQUARE: Final = 4.0
+"""Reduced chi-square above which points do not follow a model: errors are then too small by a factor of 2."""
+
+
+class ErrorLimit(NamedTuple):
+    """The largest error of a parameter that is good enough.
+
+    Attributes:
+        value: SI; a fraction if it is relative to the parameter's value.
+        is_relative: Whether it is.
+    """
+
+    value: float
+    is_relative: bool
+
+    def is_met_by(self, parameter: Parameter) -> bool:
+        """Whether a parameter is known so well."""
+        return parameter.error <= self.value * (abs(parameter.value) if self.is_relative else 1.0)
+
+
+def read_limit(written: float | str, unit: str) -> ErrorLimit:
+    """Read the error that a parameter is to have: per cent of its value, or a quantity of its own.
+
+    Args:
+        written: As the sequence has it.
+        unit: SI unit of the parameter, see :func:`labseq.data.fits.parameter_unit`.
+
+    Raises:
+        ValueError: It is neither, or not above 0; says why.
+
+    Example:
+        >>> read_limit("2 %", "s"), read_limit("0.5 ms", "s")
+        (ErrorLimit(value=0.02, is_relative=True), ErrorLimit(value=0.0005, is_relative=False))
+    """
+    text = str(written)
+    number, written_unit = split_quantity(text)
+    dimension = "" if dimension_of(unit) == "fraction" else dimension_of(unit)
+    if math.isnan(number) or number <= 0:
+        raise ValueError(f"'{clean(text)}' is not an error")
+    if written_unit == "":
+        if dimension:
+            raise ValueError(f"'{clean(text)}' has no unit")
+        return ErrorLimit(number, is_relative=False)
+    value, written_dimension = parse_any(text)
+    if written_dimension not in ("fraction", dimension):
+        raise ValueError(f"'{clean(text)}' does not have the unit of the parameter")
+    return ErrorLimit(value, is_relative=written_dimension == "fraction")
+
+
+def follows(fit: Fit) -> bool:
+    """Whether the points have errors and follow the model."""
+    return fit.reduced_chi_square <= MAX_CHI_SQUARE
