@@ -17,6 +17,7 @@ from labseq.data import open_run
 from labseq.data.follower import Follower
 from labseq.files import data_root
 from labseq.recording.listing import newest_run
+from labseq.session.stopping import is_running
 
 
 def watch_run(
@@ -39,7 +40,8 @@ def watch_run(
                 wait(0.5)
             _watch_one(run_dir := newest, shown, wait)
     except KeyboardInterrupt:
-        say(f"no longer watched; the run {run_dir} continues if it is not over", stream=shown)
+        state = "continues" if is_running(run_dir) else "is over"
+        say(f"no longer watched; the run {run_dir} {state}", stream=shown)
 
 
 def _watch_one(run_dir: Path, shown: TextIO, wait: Callable[[float], None]) -> None:

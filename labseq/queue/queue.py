@@ -366,7 +366,9 @@ def _read(file: Path) -> Entry | None:
             first_error = error.errors()[0]
             problem = f"{'.'.join(map(str, first_error['loc']))}: {first_error['msg']}"
         raise RecordingError(file, f"is a damaged queue entry: {problem}", "move it away") from error
-    return replace(entry, options=replace(entry.options, overrides=tuple(entry.options.overrides)))
+    options = entry.options
+    options = replace(options, overrides=tuple(options.overrides), tags=tuple(options.tags))
+    return replace(entry, options=options)
 
 
 def _check(entry: Entry, file: Path) -> None:
