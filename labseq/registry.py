@@ -131,7 +131,7 @@ class Registry:
         try:
             yield registry
         except BaseException:
-            registry._is_closed = True
+            registry._is_closed = True  # first: the thread of a plugin that hung may still go on to register
             self.forget(owner.name)
             raise
         finally:

@@ -219,7 +219,7 @@ class PluginHost:
     def load_builtin(self, module: ModuleType) -> None:
         """Register a module of labseq itself; its failure is a bug in labseq and raises."""
         info = PluginInfo(module.__name__, "built in", __version__)
-        self._register(info, None, lambda: module)
+        self._run_code(info, None, lambda: module)
         self._infos[info.name] = info
 
     def load_entry_points(self) -> None:
@@ -228,7 +228,7 @@ class PluginHost:
             name, version = ("", "") if point.dist is None else name_and_version(point.dist)
             source = f"the distribution {name or 'unknown'} {version}".rstrip()
             info = PluginInfo(point.name, "installed", version, source=source)
-            self._load(info, partial(module_location, point.value.partition(":")[0]), point.load)
+            self._load(info, module_location(point.value.partition(":")[0]), point.load)
 
     def load_folders(self, folders: Sequence[Path]) -> None:
         """Load single files and packages from folders, and from those of --plugins and LABSEQ_PLUGIN_PATH.
@@ -266,12 +266,12 @@ class PluginHost:
         if not name.isidentifier():
             reason = "its name is not a Python name: letters, digits and '_' only; rename it"
             self._infos[name] = replace(info, state="failed", reason=reason)
-        elif not self._load(info, partial(plugin_location, path), partial(import_file, name, path)):
+            return
+        self._load(info, plugin_location(path), partial(import_file, name, path))
+        if self._infos[name].state == "failed":  # else the modules are those of a plugin that works
             forget(name)
 
-    def _load(
-        self, info: PluginInfo, home: Callable[[], Path | None], importing: Callable[[], ModuleType]
-    ) -> bool:
+    def _load(self, info: PluginInfo, home: Path | None, importing: Callable[[], ModuleType]) -> None:
         """Load a plugin; whether it failed, and why, is in the report."""
         if info.name in self._infos:
             taken = self._infos[info.name]
@@ -279,17 +279,36 @@ class PluginHost:
             if taken.origin == "installed":
                 other_plugin = f"an installed plugin (of {taken.source})"
             reason = f"{other_plugin} is already called '{info.name}'; rename one of them"
-            failed = replace(info, name=f"{info.name} ({info.source})", state="failed", reason=reason)
-            self._infos[failed.name] = failed
-            return True  # the modules of that name belong to the other plugin
-        try:
-            self._register(info, home, importing)
-        except PluginLoadError as error:
-            info = replace(info, state="failed", reason=error.reason)
-        except Exception as error:  # noqa: BLE001 - pluggy has further checks
-            info = replace(info, state="failed", reason=format_error(error))
+            info = replace(info, name=f"{info.name} ({info.source})", state="failed", reason=reason)
+        else:
+            try:
+                self._run_code(info, home, importing)
+            except PluginLoadError as error:
+                info = replace(info, state="failed", reason=error.reason)
+            except Exception as error:  # noqa: BLE001 - pluggy refuses a module that has another name already
+                info = replace(info, state="failed", reason=format_error(error))
         self._infos[info.name] = info
-        return info.state == "loaded"
+
+    def _run_code(self, info: PluginInfo, home: Path | None, importing: Callable[[], ModuleType]) -> None:
+        """Import a plugin, check it and have it register what it offers; of one that fails nothing stays.
+
+        Args:
+            home: The file or the folder that its code is in; None if that is not known.
+            importing: Imports it.
+        """
+        owner = Owner(info.name, info.source, home, self._patience_s, info.notes)
+        with self.registry.opened_for(owner) as registry:
+
+            def run() -> ModuleType:
+                module = importing()
+                check_api(module, owner)
+                hooks = hooks_of(module, owner)
+                if "labseq_register" in hooks:
+                    hooks["labseq_register"](registry=registry)
+                return module
+
+            # in one guarded call, so that the time limit is for all of it
+            self._pluggy.register(call_plugin(owner, "", run), info.name)
 
     def _is_new(self, path: Path) -> bool:
         """Whether a file is neither a plugin that was found already nor an installed library."""
@@ -299,20 +318,6 @@ class PluginHost:
         if any(file and Path(file).resolve() == resolved for file in files):
             return False
         return module_location(plugin_name(path)) != plugin_location(path) or _states_api(path)
-
-    def _register(
-        self, info: PluginInfo, home: Callable[[], Path | None] | None, importing: Callable[[], ModuleType]
-    ) -> None:
-        location = None if home is None else home()
-        owner = Owner(info.name, info.source, location, self._patience_s, info.notes)
-        with self.registry.opened_for(owner) as registry:
-            module = call_plugin(owner, "", partial(_prepare, importing, owner, registry))
-            self._pluggy.register(module, info.name)
-            try:
-                self._pluggy.check_pending()
-            except BaseException:
-                self._pluggy.unregister(module)
-                raise
 
     def get(self, kind: str, name: str, file: Path | None = None) -> Entry:
         """Find the registry entry of a name in a sequence or profile.
@@ -356,16 +361,6 @@ class PluginHost:
             )
             for implementation in getattr(self._pluggy.hook, hook).get_hookimpls()
         ]
-
-
-def _prepare(importing: Callable[[], ModuleType], owner: Owner, registry: Registry) -> ModuleType:
-    """Run all code of a plugin that runs when it is loaded."""
-    module = importing()
-    check_api(module, owner)
-    hooks = hooks_of(module, owner)
-    if "labseq_register" in hooks:
-        hooks["labseq_register"](registry=registry)
-    return module
 
 
 def _states_api(path: Path) -> bool:
