@@ -23,7 +23,6 @@ from typing import Any, Final, ParamSpec, TypeVar
 
 from labseq.errors import DeviceError, DeviceHungError, LabseqError, PlanError, StopRequested
 from labseq.messages import format_error
-from labseq.processes import Pulse
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -36,6 +35,38 @@ SHOT_GRACE_S: Final = 2.0
 """The same for the steps of a shot, whose own call into a device has its grace first."""
 DRIVER_MARGIN_S: Final = 2.0
 """A call counts as hung this long after the timeout that the driver itself was given."""
+
+
+class Pulse:
+    """Progress of one thread, for the heartbeat that another thread sends.
+
+    The thread beats wherever it waits, whatever it waits for; what it does between two waits is short.
+    """
+
+    def __init__(self) -> None:
+        self._n = self._n_before = 0
+        self._silent_s = 0.0
+        self.begin()
+
+    def begin(self) -> None:
+        """Follow the calling thread from now on."""
+        self._thread = threading.get_ident()
+        self._n += 1
+
+    def beat(self) -> None:
+        """Note progress; calls from other threads do not count."""
+        if threading.get_ident() == self._thread:
+            self._n += 1
+
+    def silent_s(self, passed_s: float) -> float:
+        """For how long there was no progress.
+
+        Args:
+            passed_s: Time since the last question, as far as it counts.
+        """
+        self._silent_s = self._silent_s + passed_s if self._n == self._n_before else 0.0
+        self._n_before = self._n
+        return self._silent_s
 
 
 class StopFlag:

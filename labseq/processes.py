@@ -8,7 +8,6 @@ import os
 import platform
 import signal
 import sys
-import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -166,38 +165,6 @@ class Holder:
             return "an unknown process"
         process = f"process {self.process.pid} on {self.process.host}"
         return f"{self.purpose} ({process}, since {_local(self.since_utc)})"
-
-
-class Pulse:
-    """Progress of one thread, for the heartbeat that another thread sends.
-
-    The thread beats wherever it waits, whatever it waits for; what it does between two waits is short.
-    """
-
-    def __init__(self) -> None:
-        self._n = self._n_before = 0
-        self._silent_s = 0.0
-        self.begin()
-
-    def begin(self) -> None:
-        """Follow the calling thread from now on."""
-        self._thread = threading.get_ident()
-        self._n += 1
-
-    def beat(self) -> None:
-        """Note progress; calls from other threads do not count."""
-        if threading.get_ident() == self._thread:
-            self._n += 1
-
-    def silent_s(self, passed_s: float) -> float:
-        """For how long there was no progress.
-
-        Args:
-            passed_s: Time since the last question, as far as it counts.
-        """
-        self._silent_s = self._silent_s + passed_s if self._n == self._n_before else 0.0
-        self._n_before = self._n
-        return self._silent_s
 
 
 class Lock:

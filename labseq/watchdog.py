@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     import subprocess
 
-    from labseq.processes import Pulse
+    from labseq.guard import Pulse
 
 WATCHDOG_LOG: Final = "watchdog.jsonl"
 """Name of its log in the folder of a run."""
@@ -344,7 +344,7 @@ class Watchdog:
         lost: Callable[[str], object] = str,
         may_end: bool = False,
     ) -> None:
-        from labseq.processes import Pulse  # not in the watchdog itself
+        from labseq.guard import Pulse  # not in the watchdog itself
 
         log_path = None if log is None else str(log.absolute())
         self._about = {"run": run_name, "log": log_path, "path": sys.path, "may_end": may_end}

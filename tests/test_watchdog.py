@@ -37,7 +37,7 @@ RUN = """
 import ctypes, os, signal, sys, threading, time
 from pathlib import Path
 from labseq import watchdog
-from labseq.processes import Pulse
+from labseq.guard import Pulse
 from labseq.watchdog import Watchdog
 
 folder = Path(sys.argv[1])

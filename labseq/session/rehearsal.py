@@ -138,5 +138,5 @@ def _summary(cycles: Sequence[FirstCycle]) -> Rehearsal:
         [float(report.batch_end_s[0]) if len(report.batch_end_s) else 0.0 for report in reports]
     )
     n_enough = sum(cycle.has_enough for cycle in cycles)
-    n_met = sum(report.meets_target for report in reports)
+    n_met = sum([report.meets_target for report in reports])
     return Rehearsal(len(reports), n_enough, n_met, durations, firsts)
