@@ -29,9 +29,6 @@ from labseq.units import format_quantity
 
 REDRAW_S: Final = 0.25
 """Minimum time between two drawings of the view, in seconds."""
-_BETWEEN_SHOTS: Final = frozenset(
-    {"run_started", "leader_awaited", "shot_finished", "shot_repeated", "run_finished"}
-)
 
 
 def observer_for(stream: TextIO, run_now: Callable[[], float] | None = None) -> LiveView | LogLines:
@@ -97,8 +94,10 @@ class LiveView:
 
     def _may_draw(self, name: str) -> bool:
         run = self._tally.record
-        is_allowed = name in _BETWEEN_SHOTS or (run is not None and run.simulated)
-        return self._live.is_started and is_allowed and self._now() - self._drawn_s >= REDRAW_S
+        is_between_shots = name in ("run_started", "leader_awaited", "shot_finished", "shot_repeated")
+        if not (is_between_shots or (run is not None and run.simulated)):
+            return False
+        return self._live.is_started and self._now() - self._drawn_s >= REDRAW_S
 
     def _draw(self) -> None:
         self._drawn_s = self._now()

@@ -29,21 +29,18 @@ LASTING: Final = frozenset(
     }
 )
 """Events that must stay on the screen above the live view."""
-FIXED: Final = {"left_on": "the static tweezers stay on; 'labseq safe PROFILE' switches them off"}
-"""Events whose line has no values."""
-_LOGGED: Final = LASTING | {"shot_finished", "scan_point", "scan_ended"}
 
 
 class LogLines:
     """Implements ``RunObserver`` by printing a line per event.
 
     Args:
-        events: Names of the events that are printed.
+        events: Names of the events that are printed; without a live view, also how each shot ended.
     """
 
-    def __init__(self, stream: TextIO, events: frozenset[str] = _LOGGED) -> None:
+    def __init__(self, stream: TextIO, events: frozenset[str] | None = None) -> None:
         self._stream = stream
-        self._events = events
+        self._events = events or LASTING | {"shot_finished", "scan_point", "scan_ended"}
         self._run: RunRecord | None = None
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
@@ -61,7 +58,9 @@ class LogLines:
         """Do nothing: the terminal was not changed."""
 
 
-def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> str:
+def event_text(  # noqa: C901 - a case for each event
+    name: str, values: Mapping[str, Any], run: RunRecord | None
+) -> str:
     """Describe an event on one line.
 
     Returns:
@@ -87,6 +86,8 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
             return f"compiled in {format_quantity(values['duration_s'], 'time')}"
         case "warning":
             return f"warning: {values['text']}"
+        case "left_on":
+            return "the static tweezers stay on; 'labseq safe PROFILE' switches them off"
         case "window_too_short" | "window_exceeded":
             return window_text(values)
         case "leader_awaited":
@@ -100,7 +101,7 @@ def event_text(name: str, values: Mapping[str, Any], run: RunRecord | None) -> s
         case "device_command":
             return f"shot {values['shot']}: {values['device']}: {values['command']}"
         case _:
-            return FIXED.get(name, "")
+            return ""
 
 
 def ended_text(values: Mapping[str, Any]) -> str:

@@ -101,7 +101,10 @@ class Follower:
                 yield Event(str(line.get("t_utc", "")), self._logged_s, name, values)
 
     def events(self) -> Generator[Event]:
-        """What the run's own observer was told since the last call, from the log, the index and shot files.
+        """What the run's own observer was told since the last call.
+
+        What the log leaves out (``UNLOGGED_EVENTS`` and ``UNLOGGED_VALUES`` in ``recording/folders.py``)
+        is read from the run's other files.
 
         Raises:
             RecordingError: The run can no longer be read.
@@ -115,15 +118,14 @@ class Follower:
         to_open = {id(shot) for shot in list(filter(None, shots))[-20:]}
         for event, shot in zip(logged, shots, strict=True):
             self._event_s, self._told_s = event.t_s, self._clock()
-            if shot is not None and id(shot) in to_open:
-                yield from _inside(shot, event)
-            yield replace(event, values={**event.values, **self._unlogged(event, shot)})
-
-    def _unlogged(self, event: Event, shot: Shot | None) -> dict[str, Any]:
-        """The values of an event that the log leaves out, as run.json and the index hold them."""
-        if event.name == "run_starting":
-            return {"record": read_record(self._run_dir)}
-        return {} if shot is None else {"row": shot.row}
+            values = dict(event.values)
+            if event.name == "run_starting":
+                values["record"] = read_record(self._run_dir)
+            if shot is not None:
+                values["row"] = shot.row
+                if id(shot) in to_open:
+                    yield from _inside(shot, event)
+            yield replace(event, values=values)
 
     def _shot_ended_by(self, event: Event) -> Shot | None:
         """The attempt that an event ends; None for other events and damaged lines."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import unicodedata
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Final
@@ -31,6 +32,18 @@ NOTES_FILE: Final = "notes.json"
 """Note and tags, see :mod:`labseq.recording.notes`; exists only if there are any."""
 LOCK_FILE: Final = ".lock"
 """Locked by the process that resumes or repairs the run."""
+
+UNLOGGED_EVENTS: Final[Mapping[str, str]] = {
+    "image": SHOTS_FOLDER,
+    "cycle": SHOTS_FOLDER,
+    "stage": SHOTS_FOLDER,  # one that exceeded its budget is logged as "over_budget"
+    "state": "",
+    "compiling": "",
+    "compiled": "",
+}
+"""Events of a run that its event log leaves out -> where their content is; "" if nowhere."""
+UNLOGGED_VALUES: Final[Mapping[str, str]] = {"record": RUN_FILE, "row": INDEX_FILE}
+"""The same for values of the events in it."""
 
 
 def slug(name: str) -> str:

@@ -9,14 +9,11 @@ from typing import Any, Final
 from labseq.errors import DeviceTimeoutError, LabseqError
 from labseq.guard import Guard
 from labseq.messages import format_error
-from labseq.model import CycleRecord, ShotRecord, StageTiming
+from labseq.model import ShotRecord, StageTiming
 from labseq.plugins.host import PluginHost
+from labseq.recording.folders import UNLOGGED_EVENTS, UNLOGGED_VALUES
 from labseq.roles import RunObserver
 
-_QUIET: Final = frozenset({"image", "cycle", "state", "compiling", "compiled", "run_finished"})
-"""Events that are not logged: the shot files hold them, or the writer logs them itself."""
-_UNLOGGED: Final = frozenset({"record", "row"})
-"""Values that run.json and the index hold."""
 _HOOKS: Final = {  # event -> observer hook of plugins, and the event's values that are its arguments
     "run_started": ("labseq_run_started", {"run": "record"}),
     "shot_finished": ("labseq_shot_finished", {"shot": "shot"}),
@@ -86,25 +83,19 @@ class Observers:
                 self._write("warning", {"text": f"{which}: {format_error(error)}"})
 
     def _write(self, name: str, values: Mapping[str, Any]) -> None:
-        if self._log is None or name in _QUIET:
+        if self._log is None or name == "run_finished":  # the writer logs it, before the run's state changes
             return
         timing = values.get("timing")
-        if isinstance(timing, StageTiming):
-            if timing.over_budget:
-                self._log("over_budget", **_timing(timing))
-            return
-        self._log(name, **{key: _plain(value) for key, value in values.items() if key not in _UNLOGGED})
-
-
-def _timing(timing: StageTiming) -> dict[str, Any]:
-    names = ("stage", "step", "cycle", "duration_s", "host_s", "budget_s")
-    return {name: getattr(timing, name) for name in names}
+        if isinstance(timing, StageTiming) and timing.over_budget:
+            names = ("stage", "step", "cycle", "duration_s", "host_s", "budget_s")
+            self._log("over_budget", **{key: getattr(timing, key) for key in names})
+        if name not in UNLOGGED_EVENTS:
+            kept = {key: value for key, value in values.items() if key not in UNLOGGED_VALUES}
+            self._log(name, **{key: _plain(value) for key, value in kept.items()})
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, ShotRecord):
         names = ("shot_index", "attempt", "status", "error", "success", "filling_fraction")
         return {name: getattr(value, name) for name in names}
-    if isinstance(value, CycleRecord):
-        return {"cycle": value.cycle, "n_batches_played": value.n_batches_played}
     return value
