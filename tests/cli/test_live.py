@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 from rich.console import Console
 
-from labseq.cli.live import REDRAW_S, LiveView, Picture, draw_scan, observer_for
-from labseq.cli.tally import Tally
+from labseq.cli.live import REDRAW_S, LiveView, Picture, Tally, draw_scan, observer_for
 from labseq.console.arrays import ASCII, UNICODE
 from labseq.console.events import LogLines
 from labseq.model import StageTiming

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.tally import Tally
+from labseq.cli.live import Tally
 from labseq.model import StageTiming
 from labseq.model.estimate import Estimate, Rate
 

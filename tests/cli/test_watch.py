@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from labseq.cli.tally import Tally
+from labseq.cli.live import Tally
 from labseq.cli.watch import watch_run
 from labseq.data import open_run
 from labseq.data.follower import Follower

@@ -10,9 +10,8 @@ from rich.console import Console
 
 import labseq
 from labseq.analysis.scanned import ScanRequest
-from labseq.cli.live import Picture, draw_scan
+from labseq.cli.live import Picture, Tally, draw_scan
 from labseq.cli.show import Tables, show_run
-from labseq.cli.tally import Tally
 from labseq.console.arrays import UNICODE
 from labseq.console.events import LogLines, event_text
 from labseq.data.follower import Follower

@@ -14,8 +14,8 @@ import pytest
 
 import labseq
 from labseq.analysis.timing import writing_s
+from labseq.cli.live import Tally
 from labseq.cli.summary import Summary
-from labseq.cli.tally import Tally
 from labseq.data.follower import Follower
 from labseq.errors import RecordingError
 from labseq.model import RunRecord
