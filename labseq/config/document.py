@@ -214,7 +214,7 @@ class Document:
 
     def override_all(
         self,
-        overrides: Iterable[Override | tuple[str, str]],
+        overrides: Iterable[Override],
         problems: ProblemCollector,
         *,
         may_add: Collection[str] = (),
@@ -226,7 +226,7 @@ class Document:
             may_add: Addresses of mappings that are added if the file has none.
         """
         document = self
-        for override in (Override(*pair) for pair in overrides):
+        for override in overrides:
             with problems:
                 document = document.override(
                     override.address, override.value, override.source, may_add=may_add

@@ -431,7 +431,7 @@ _FALLBACKS: Final = FallbackValues(
 def load_profile(
     name_or_path: str | Path,
     *,
-    overrides: Sequence[Override | tuple[str, str]] = (),
+    overrides: Sequence[Override] = (),
     named_in: Document | None = None,
     scan: Scan | None = None,
     problems: ProblemCollector | None = None,
@@ -453,13 +453,7 @@ def load_profile(
     beside = Path() if named_in is None else named_in.path.parent
     document = Document.read(find_profile(name_or_path, beside, named_in=named_in), kept)
     check_kind(document, "hardware profile")
-    placed = [_of_profile(Override(*override)) for override in overrides]
     with collecting(problems) as collector:
-        document = document.override_all(placed, collector, may_add=MAY_ADD).evaluated()
+        document = document.override_all(overrides, collector, may_add=MAY_ADD).evaluated()
         document = document if scan is None else scan.bound(document).at_first_point(document, profile=True)
         return load_checked(document, ProfileSpec, "a hardware profile", _FALLBACKS, collector)
-
-
-def _of_profile(override: Override) -> Override:
-    origin = override.origin or f"--set profile.{override.address}={override.value}"
-    return Override(override.address, override.value, origin)

@@ -281,7 +281,7 @@ class AdaptiveScan(Scan):
 
 def at_first_point(
     document: Document,
-    overrides: Sequence[Override | tuple[str, str]],
+    overrides: Sequence[Override],
     profile_set: Sequence[Override],
     problems: ProblemCollector,
 ) -> tuple[Document, Scan | None]:
@@ -293,14 +293,13 @@ def at_first_point(
         profile_set: Those of the profile, with their "profile.".
         problems: Receives those of the scan; without a valid scan the copy has none.
     """
-    of_sequence = [Override(*override) for override in overrides]
     try:
-        scan = read_scan(document, [*of_sequence, *profile_set])
+        scan = read_scan(document, [*overrides, *profile_set])
     except ConfigError as error:
         problems.add(error)
         return _without_scan(document), None
     n_shots, shots = scan.n_points * scan.repeats, document.data.get("shots")
-    is_option = any(override.address == "shots" for override in of_sequence)
+    is_option = any(override.address == "shots" for override in overrides)
     if shots is None:
         document = document.override("shots", str(n_shots), "the scan")
     elif type(shots) is int and (shots > n_shots if is_option else shots != n_shots):

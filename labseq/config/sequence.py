@@ -271,7 +271,7 @@ _FALLBACKS: Final = FallbackValues(
 
 def load_sequence(
     path: Path,
-    overrides: Sequence[Override | tuple[str, str]] = (),
+    overrides: Sequence[Override] = (),
     *,
     profile_set: Sequence[Override] = (),
     problems: ProblemCollector | None = None,
@@ -280,7 +280,7 @@ def load_sequence(
     """Read a sequence file.
 
     Args:
-        overrides: Values that replace those in the file: (address, value) each.
+        overrides: Values that replace those in the file.
         profile_set: Overrides of the profile, with their "profile."; they replace a scan of their address.
 
     Returns:

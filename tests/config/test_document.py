@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from labseq.config.addresses import Override
 from labseq.config.document import Document, FallbackValues, StoredText, load_checked
 from labseq.config.profile import load_profile
 from labseq.config.sequence import SequenceSpec, load_sequence
@@ -49,8 +51,8 @@ def test_override(document: Document, address: str, value: str, expected: dict[s
 
 
 def test_overrides_of_a_step_of_an_empty_step_and_of_a_list_item(document: Document) -> None:
-    options = [("shot.sort.cycles", "3"), ("shot.0.load.duration", "1 s"), ("shot.1.rearrange.window.1", "9")]
-    changed = document.override_all(options, ProblemCollector())
+    options = {"shot.sort.cycles": "3", "shot.0.load.duration": "1 s", "shot.1.rearrange.window.1": "9"}
+    changed = document.override_all(starmap(Override, options.items()), ProblemCollector())
     assert changed.data["shot"] == [
         {"load": {"duration": "1 s"}},
         {"name": "sort", "rearrange": {"cycles": 3, "window": [1, 9]}},
@@ -98,7 +100,7 @@ def test_override_that_is_no_value(document: Document, value: str, message: str)
 
 def test_all_wrong_overrides_are_reported(document: Document) -> None:
     problems = ProblemCollector()
-    document.override_all([("a.b", "1"), ("shots", "5"), ("shots", "{")], problems)
+    document.override_all(starmap(Override, [("a.b", "1"), ("shots", "5"), ("shots", "{")]), problems)
     assert [problem.source for problem in problems.problems] == ["--set a.b=1", "--set shots={"]
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from labseq.config.addresses import Override, split_overrides
 from labseq.config.document import Document
 from labseq.config.profile import (
     BudgetSettings,
@@ -103,7 +104,9 @@ def test_the_grid_of_the_paper_is_the_default() -> None:
 
 
 def with_option(address: str, value: str) -> ProfileSpec:
-    return load_profile(DATA / "profile.yaml", overrides=[(address, value)])[1]
+    return load_profile(DATA / "profile.yaml", overrides=split_overrides([f"profile.{address}={value}"])[1])[
+        1
+    ]
 
 
 def test_options_reach_the_profile() -> None:
@@ -112,7 +115,9 @@ def test_options_reach_the_profile() -> None:
     assert with_option("mobile_tweezers.rf.max_peak", "1.5 V").motion.rf.max_peak_v == 1.5
     table = "[98 MHz, 100.1 MHz, 102 MHz]"
     options = [("grid.cols", "3"), ("grid.column_frequency", f"{{table: {table}}}")]
-    grid = load_profile(DATA / "profile.yaml", overrides=options)[1].grid_model()
+    grid = load_profile(DATA / "profile.yaml", overrides=[Override(*option) for option in options])[
+        1
+    ].grid_model()
     np.testing.assert_array_equal(grid.column_frequency_hz, [98e6, 100.1e6, 102e6])
 
 
@@ -200,7 +205,7 @@ def test_the_first_message(tmp_path: Path, old: str, new: str, message: str) -> 
 def calibrations(folder: Path, text: str, *overrides: tuple[str, str]) -> CalibrationSettings:
     path = folder / "bench.yaml"
     path.write_text((DATA / "profile.yaml").read_text("utf-8") + text, "utf-8")
-    return load_profile(path, overrides=overrides)[1].calibrations
+    return load_profile(path, overrides=[Override(*override) for override in overrides])[1].calibrations
 
 
 @pytest.mark.parametrize(

@@ -17,13 +17,13 @@ DATA = Path(__file__).parent / "data"
 SMALL = "labseq: 1\nname: s\nshots: 1\ntarget: {pattern: compact}\nshot: [{load: {}}]\n"
 
 
-def load(folder: Path, text: str, *overrides: Override | tuple[str, str]) -> SequenceSpec:
+def load(folder: Path, text: str, *overrides: Override) -> SequenceSpec:
     path = folder / "s.yaml"
     path.write_text(text, encoding="utf-8")
     return load_sequence(path, overrides)[1]
 
 
-def refusal(folder: Path, text: str, *overrides: Override | tuple[str, str]) -> str:
+def refusal(folder: Path, text: str, *overrides: Override) -> str:
     with pytest.raises(ConfigError) as caught:
         load(folder, text, *overrides)
     return str(caught.value).removeprefix(str(folder / "s.yaml"))
@@ -55,17 +55,17 @@ def test_everything_in_it() -> None:
 def test_default_planner_can_be_set(tmp_path: Path, planner: str) -> None:
     path = tmp_path / "s.yaml"
     path.write_text(SMALL + planner, encoding="utf-8")
-    document, spec, _ = load_sequence(path, [("planner.degree_of_parallelism", "3")])
+    document, spec, _ = load_sequence(path, [Override("planner.degree_of_parallelism", "3")])
     assert document.get(spec.planner.loc) == {"use": "psca", "degree_of_parallelism": 3}
 
 
 def test_wrong_override_names_its_option(tmp_path: Path) -> None:
-    assert refusal(tmp_path, SMALL, ("shots", "0")).startswith("--set shots=0: ")
+    assert refusal(tmp_path, SMALL, Override("shots", "0")).startswith("--set shots=0: ")
     assert refusal(tmp_path, SMALL, Override("shots", "0", "--shots 0")).startswith("--shots 0: ")
 
 
 def test_an_override_replaces_a_wrong_value(tmp_path: Path) -> None:
-    assert load(tmp_path, SMALL.replace("shots: 1", "shots: many"), ("shots", "2")).shots == 2
+    assert load(tmp_path, SMALL.replace("shots: 1", "shots: many"), Override("shots", "2")).shots == 2
 
 
 def test_only_the_newer_format_is_reported(tmp_path: Path) -> None:
