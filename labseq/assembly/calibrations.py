@@ -98,6 +98,7 @@ def calibrated(
             if stored is not None:
                 check_grid(stored.entry, grid, str(stored.path))
                 entries[kind] = stored.entry
+    # before the tones: an overlay that is left out must not move them
     warnings = [*_dropped(entries), *_doubtful(entries, detector or {})]
     tones = grid
     with problems:

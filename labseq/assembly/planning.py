@@ -309,6 +309,7 @@ def plan_moves(
         try:
             report = check_plan(plan, occupancy, target, dop, grid, motion, request.planner)
         except InvalidPlanError as error:
+            # a plan that is wrong as a whole has no first batches that could be shown
             if not keep_refused or error.batch < 0:
                 raise
             refused, before = error, plan.first(error.batch)

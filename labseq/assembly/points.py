@@ -66,6 +66,7 @@ class ScanPoints:
         # at each point, the errors that are there anyway would come once more
         known = set(self.scan.explained(ConfigError(problems.problems)).problems)
         n_before = len(problems.problems)
+        # of an adaptive scan these are the corners of its ranges
         for number in range(math.prod(self.scan.shape)):
             try:
                 self.at(number)

@@ -194,6 +194,7 @@ class Document:
             ConfigError: The address does not exist, or the value is not valid YAML.
         """
         loc = find(self.root, address, origin, may_add)
+        # an option without a value means null, as an empty value in a file does
         node = compose(value, origin, is_option=True) or Node(None, Mark(origin))
         return self.with_values([(loc, node, None)])
 
@@ -342,6 +343,7 @@ def _without_wrong_values(document: Document, model: SettingsType, fallbacks: Fa
         if not isinstance(findings, list):
             break
         values = dict(cast("dict[str, Node]", root.value))
+        # an item of a list is replaced as a whole, so that the other items can still be checked
         for loc in dict.fromkeys(finding.loc[:2] for finding in findings if finding.loc):
             key, around = str(loc[0]), values.get(str(loc[0]))
             if len(loc) > 1 and key in fallbacks.items and around and around.at(loc[1:]) and loc not in seen:

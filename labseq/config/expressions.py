@@ -124,6 +124,7 @@ def _multiply(x: Quantity, y: Quantity) -> Quantity:
 def _divide(x: Quantity, y: Quantity) -> Quantity:
     if y.amount == 0:
         raise ExpressionError("this divides by zero")
+    # 6 / 2 stays a whole number, because settings that count something take no other
     is_whole = isinstance(x.amount, int) and isinstance(y.amount, int) and x.amount % y.amount == 0
     amount = x.amount // y.amount if is_whole else x.amount / y.amount
     return _checked(amount, tuple(map(operator.sub, x.powers, y.powers)))
@@ -191,6 +192,7 @@ def _call(name: str, values: list[Quantity]) -> Quantity:
 
 _UNITS: Final = "|".join(
     re.escape(unit)
+    # the longest first: "um/ms" is one unit, not "um" divided by something
     for unit in sorted({*(unit for units in UNITS.values() for unit in units), "degC"}, key=len)[::-1]
     if unit not in ("", "%")
 )
@@ -234,6 +236,7 @@ def _parse(text: str) -> _Parsed:
             raise _unexpected(text, at)
         if token["number"] or token["name"]:
             values[at - shift] = token["name"] or _literal(token, at)
+            # as long as before, so that a place in the tree is a place in the expression
             replaced += "x".ljust(len(token[0]))
         else:
             replaced += token[0] if token[0].strip() else " " * len(token[0])
@@ -408,6 +411,7 @@ class _Evaluator:
             sorter.prepare()
         except CycleError as error:
             self._report_cycle(error.args[1][::-1], references)
+        # after a circle, too: what it does not block is still computed, to report its errors
         while ready := sorter.get_ready():
             for loc in ready:
                 if loc in references:
@@ -473,6 +477,7 @@ class _Evaluator:
         return Quantity(amount, POWERS[dimension])
 
     def _report_cycle(self, ring: list[Loc], references: Mapping[Loc, Mapping[str, Loc]]) -> None:
+        # a circle has no beginning: the message starts with the expression that comes first in the file
         start = ring.index(next(loc for loc in self.nodes if loc in ring))
         ring = [*ring[start:-1], *ring[: start + 1]]
         way = " -> ".join(".".join(map(str, loc)) for loc in ring)

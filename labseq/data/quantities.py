@@ -143,7 +143,7 @@ def quantity_problem(
     """
     kind, named, sites = parse_name(name)
     if kind not in OF_IMAGES:
-        if not named and (name in columns or name.startswith(open_prefixes or ("\0",))):
+        if not named and (name in columns or name.startswith(open_prefixes)):
             return None
         near = closest(kind, [*OF_IMAGES, *columns])
         hint = f"did you mean '{near}'?" if near else ""

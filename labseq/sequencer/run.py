@@ -114,6 +114,7 @@ def open_devices(
     if "static_tweezers" in names:
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
+    # after all are open: what settles has had the time since it was opened, and the others need not wait
     for name, device in lab.hardware():
         if name not in names:
             continue

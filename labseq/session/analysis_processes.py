@@ -108,6 +108,7 @@ class AnalysisProcesses:
 
     def finish(self) -> None:
         """After the run: give each analysis time for the remaining shots, then report missing results."""
+        # all are told first, so that they work through their last shots at the same time
         for process in self._processes.values():
             process.end_of_run()
         end_s = time.monotonic()
@@ -254,6 +255,7 @@ class _AnalysisProcess:
         while True:
             is_running, now_s = self._process.poll() is None, time.monotonic()
             self._results.read()
+            # the time that it has begins with its first result: starting takes seconds
             if self._size() == self._size_before and now_s < self._start_s + MAX_START_S:
                 asked_s = now_s
             found = {shot: self._results.rows[shot] for shot in shots if shot in self._results.rows}

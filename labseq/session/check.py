@@ -61,6 +61,7 @@ class _Checks:
 
     def of(self, point: Point) -> _PointCheck:
         """The checks of a point."""
+        # by identity: points share the objects that are the same at both
         key = (*point.lab_key, *(id(step) for _, step in point.steps))
         if key not in self._points:
             if point.lab_key not in self._labs:
@@ -418,11 +419,13 @@ def _rehearse_all(checks: _Checks, points: Iterable[_PointCheck], runs: bool) ->
     distinct: dict[tuple[object, ...], _PointCheck] = {}
     for point_check in points:
         distinct.setdefault(point_check.rehearsal_key, point_check)
+    # the first point may take MAX_WAIT_S; all others together as long again
     wait_s, asked = MAX_WAIT_S / max(1, len(distinct) - 1), set[int]()
     for n, (key, point_check) in enumerate(distinct.items()):
         checks.rehearsals[key] = []
         if not point_check.windows:
             continue
+        # points may share a lab, whose kernels and devices are asked once
         is_new = id(point_check.lab) not in asked
         if is_new:
             run.warm(point_check.lab, devices=runs and n == 0)
@@ -452,6 +455,7 @@ def _plan_options(assembly: Assembly, point: Point) -> str:
 def _window_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
     document, shot = point_check.point.document, point_check.shot
     windows, rehearsals = point_check.windows, point_check.rehearsed
+    # a slow planner made too few plans in the time there was to judge a window by
     if (
         min((rehearsal.n_loadings for rehearsal in rehearsals.values()), default=0)
         < N_LOADINGS_ELSEWHERE // 4

@@ -65,6 +65,7 @@ class Observers:
             if plugin in self._hung:
                 continue
             try:
+                # despite a stop request: plugins learn of the end of a run that was stopped, too
                 self._guard.call_despite_stop(plugin, MAX_WAIT_S, call)
             except LabseqError as error:
                 if isinstance(error, DeviceTimeoutError):

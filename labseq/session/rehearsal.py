@@ -122,6 +122,7 @@ def _first_cycles(
             report = checked(plan)
             if cycle == 0:
                 yield FirstCycle(plan, report, int(occupancy.sum()) >= lab.target.n_atoms)
+            # later cycles are planned only to know where the next rearrangement begins
             if number == len(windows) - 1:
                 break
             n_played = fitting_batches(report, plan, window_s)
