@@ -317,7 +317,7 @@ class PluginHost:
         resolved = path.resolve()
         if any(file and Path(file).resolve() == resolved for file in files):
             return False
-        # a module that Python imports from this folder anyway is a library beside the plugins, unless it is one
+        # what Python imports from this folder anyway is a library beside the plugins, unless it states that
         return module_location(plugin_name(path)) != plugin_location(path) or _states_api(path)
 
     def get(self, kind: str, name: str, file: Path | None = None) -> Entry:
