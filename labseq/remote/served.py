@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
-from labseq.errors import DeviceError, StopRequested
+from labseq.errors import ConfigError, DeviceError, Problem, StopRequested
 from labseq.messages import format_error
 from labseq.remote.drivers import DESCRIBING, ClientDriver, DeviceEntry
 from labseq.remote.sessions import Session
@@ -46,13 +46,20 @@ class Call:
 _TYPES: Final = {"session": bytes, "n": int, "call": str, "args": list, "named": dict}
 
 
+class ForControlError(Exception):
+    """A message for the control came to the port of a device."""
+
+
 def read_call(parts: list[Any]) -> Call:
     """The call in a message.
 
     Raises:
         MessageError: The message is damaged, or is not a call.
+        ForControlError: It is the first message of a client, which is for the control.
     """
     message = unpack(parts)
+    if isinstance(message, dict) and message.get("op") == "hello":
+        raise ForControlError
     if not isinstance(message, dict) or any(
         type(message.get(key)) is not kind for key, kind in _TYPES.items()
     ):
@@ -74,6 +81,7 @@ class ServedDevice:
     Args:
         entry: The device.
         socket: A ROUTER; used in the device's thread only.
+        control_port: The port that clients have to connect to first.
         is_known: Whether a client's key is still known.
         report: Receives what happens, for the operator.
     """
@@ -82,6 +90,7 @@ class ServedDevice:
         self,
         entry: DeviceEntry,
         socket: Any,
+        control_port: int,
         is_known: Callable[[str], bool],
         report: Callable[[str], object],
     ) -> None:
@@ -93,6 +102,7 @@ class ServedDevice:
         self.failure: BaseException | None = None
         self._entry = entry
         self._socket = socket
+        self._control_port = control_port
         self._is_known = is_known
         self._report = report
         self._ended = threading.Event()
@@ -185,6 +195,8 @@ class ServedDevice:
             call = read_call([frame.buffer for frame in frames[1:]])
         except MessageError as error:
             return self._refusal(0, f"the server cannot read a message: {error}")
+        except ForControlError:
+            return pack({"n": 0, "error": report_error(self._wrong_port())})
         session = self.sessions.get(call.session)
         if session is None:
             return self._refusal(call.n, why_ended(self.ended, call.session))
@@ -207,6 +219,10 @@ class ServedDevice:
         elif number > session.number + 1:
             self.end_session(session, f"its calls came out of order: {number} after {session.number}")
         return session.ended
+
+    def _wrong_port(self) -> ConfigError:
+        what = f"this is the port of a device, '{self.name}', and not of its server"
+        return ConfigError(Problem(what, expected=f"port {self._control_port}", hint="change 'address'"))
 
     def _refusal(self, number: int, text: str) -> list[Any]:
         return pack({"n": number, "error": report_error(DeviceError(self.name, text))})

@@ -193,7 +193,8 @@ class Server:
             socket = server_socket(self._zmq, host, port, own)
             for number, entry in enumerate(entries, 1):
                 at_device = server_socket(self._zmq, host, port + number, own)
-                self.devices[entry.name] = ServedDevice(entry, at_device, self._keys.is_known, self._report)
+                known = self._keys.is_known
+                self.devices[entry.name] = ServedDevice(entry, at_device, port, known, self._report)
         except ConfigError:
             self._zmq.destroy(linger=0)
             raise

@@ -7,10 +7,11 @@ import platform
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any, Final
 
-from labseq.plugin import DeviceError, wire
+from labseq.plugin import ConfigError, DeviceError, wire
 from labseq_remote.life import Life
 from labseq_remote.settings import RemoteSettings
 
@@ -42,11 +43,16 @@ class Control:
 
         Raises:
             DeviceError: The server does not answer, refuses, or has another version.
+            ConfigError: This is the port of a device, not of its server.
         """
         self._socket.connect(wire.endpoint(settings.host, settings.port))
         me = {"protocol": wire.PROTOCOL, "labseq": version("labseq")}
         who = f"{platform.node()}, process {os.getpid()}"
-        about = self.ask("hello", CONNECT_S, device=settings.device, kind=kind, who=who, **me)
+        try:
+            about = self.ask("hello", CONNECT_S, device=settings.device, kind=kind, who=who, **me)
+        except ConfigError as error:  # the port is that of a device; the server does not know this profile
+            place = f"{self._life.device} at {self._life.address}"
+            raise ConfigError([replace(problem, source=place) for problem in error.problems]) from error
         if not isinstance(about, dict) or about.get("protocol") != wire.PROTOCOL:
             raise self._life.failure("it is not a server of this version of labseq")
         self._session = {"session": about["session"]}

@@ -152,6 +152,18 @@ def test_a_message_that_cannot_be_read_is_an_error_of_the_device(server: Served,
             device.command("open")
 
 
+def test_the_port_of_a_device_is_not_that_of_its_server(server: Served) -> None:
+    device = RemoteDevice(
+        server.settings("instrument", port=server.port + 1),
+        Context("laser", SiteGrid(6, 7), clock=FakeClock()),
+    )
+    place = rf"laser at tcp://127.0.0.1:{server.port + 1}"
+    with pytest.raises(
+        ConfigError, match=f"^{place}: this is the port .*; expected port {server.port}; change"
+    ):
+        device.open()
+
+
 def test_a_slow_network_is_no_failure(server: Served, faulty: Proxy) -> None:
     def delay(message: list[bytes]) -> list[list[bytes]]:
         time.sleep(0.1)
