@@ -111,11 +111,13 @@ class Registry:
 
     Attributes:
         contested: Kind and name that more than one plugin offers -> the error.
+        used: Kind and name of what was asked for by :meth:`get`, and the plugin that offers it.
     """
 
     def __init__(self, call: Call = lambda _owner, _what, work: work()) -> None:
         self._call = call
         self.contested: dict[tuple[str, str], PluginLoadError] = {}
+        self.used: dict[tuple[str, str], str] = {}
         self._entries: dict[tuple[str, str], Entry] = {}
         self._owner = Owner("labseq")
         self._is_closed = False
@@ -128,6 +130,7 @@ class Registry:
         """
         registry = Registry(self._call)
         registry._owner, registry._entries, registry.contested = owner, self._entries, self.contested
+        registry.used = self.used
         try:
             yield registry
         except BaseException:
@@ -272,7 +275,7 @@ class Registry:
         return entry
 
     def get(self, kind: str, name: str) -> Entry:
-        """Find an entry, for a plugin that builds on another one.
+        """Find an entry that is going to be used, for a plugin that builds on another one, too.
 
         Raises:
             UnknownPluginError: There is no such entry.
@@ -281,6 +284,7 @@ class Registry:
         entry = self.find(kind, name)
         if entry is None:
             raise UnknownPluginError(kind, name, self.names(kind))
+        self.used[kind, name] = entry.origin
         return entry
 
     def names(self, kind: str) -> list[str]:
@@ -295,7 +299,7 @@ class Registry:
 
     def entries(self, origin: str | None = None) -> list[Entry]:
         """All entries, or those of one plugin, by kind and name."""
-        return [self.get(*key) for key in self.offers(origin)]
+        return [entry for key in self.offers(origin) if (entry := self.find(*key)) is not None]
 
 
 def _import_place(value: Any) -> Any:

@@ -96,14 +96,14 @@ def _look_up_once(patch: pytest.MonkeyPatch) -> None:
 
     A process of labseq looks each up once; the tests are thousands of such processes in one.
     """
-    from labseq.session import provenance
+    from labseq.session import sources
 
     entry_points, read_text = importlib.metadata.entry_points, importlib.metadata.PathDistribution.read_text
     installed = cache(lambda _path, **which: entry_points(**which))
     patch.setattr(importlib.metadata, "entry_points", lambda **which: installed(tuple(sys.path), **which))
     patch.setattr(importlib.metadata.PathDistribution, "read_text", cache(read_text))
     patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
-    patch.setattr(provenance, "_git", partial(_git_here_once, vars(provenance)["_git"], {}))
+    patch.setattr(sources, "_git", partial(_git_here_once, vars(sources)["_git"], {}))
 
 
 def _be_quick(patch: pytest.MonkeyPatch) -> None:

@@ -145,8 +145,9 @@ def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, problem
     """Find lines that are on during unknown steps."""
     if spec.lines is None:
         return
-    entries = [host.registry.get("step", name) for name in host.registry.names("step")]
-    steps = [entry.name for entry in entries if getattr(entry.factory, "takes_time", True)]
+    registry = host.registry
+    entries = {name: registry.find("step", name) for name in registry.names("step")}
+    steps = [name for name, entry in entries.items() if entry and getattr(entry.factory, "takes_time", True)]
     known = [IDLE, *steps]
     for name, channel in spec.lines.channels.items():
         for place, kind in enumerate(channel.on):
@@ -269,16 +270,14 @@ def _in_dry_run(
     host: PluginHost, document: Document, kind: str, choice: Choice, dry_run: DryRun
 ) -> tuple[ChosenPlugin, str]:
     """The plugin with its simulated device, else its virtual twin; and a warning for the user or ""."""
-    entry = host.get(kind, VIRTUAL_TWIN)
-    defaults = None if entry.settings_model is None else entry.settings_model()
-    twin = ChosenPlugin(entry, defaults, document, choice.loc)
     if kind == "simulation":  # one at another computer has an identity, as hardware has
         chosen = resolve(host, document, kind, choice)
         elsewhere = chosen.settings is not None and chosen.settings.identities()
-        return (twin if elsewhere else chosen), ""
+        return (_twin(host, document, kind, choice) if elsewhere else chosen), ""
     if dry_run == "fast":
-        return twin, ""
+        return _twin(host, document, kind, choice), ""
     if absence := _absence(host, kind, choice.use):
+        twin = _twin(host, document, kind, choice)
         return twin, f"{absence}; its virtual twin takes its place and its settings were not checked"
     chosen = resolve(host, document, kind, choice)
     if chosen.entry.virtual_time:
@@ -287,7 +286,15 @@ def _in_dry_run(
         settings = chosen.settings.model_copy(update=dict(chosen.entry.simulated))
         return replace(chosen, settings=settings), ""
     reason = chosen.entry.no_simulator
+    twin = _twin(host, document, kind, choice)
     return twin, f"{reason}; its virtual twin takes its place" if reason else ""
+
+
+def _twin(host: PluginHost, document: Document, kind: str, choice: Choice) -> ChosenPlugin:
+    """The virtual twin of a role."""
+    entry = host.get(kind, VIRTUAL_TWIN)
+    defaults = None if entry.settings_model is None else entry.settings_model()
+    return ChosenPlugin(entry, defaults, document, choice.loc)
 
 
 def _absence(host: PluginHost, kind: str, name: str) -> str:

@@ -20,7 +20,6 @@ from labseq.processes import Lock
 from labseq.recording.folders import LOCK_FILE
 from labseq.recording.run_file import read_owner, sha256_of_text
 from labseq.roles import RunObserver
-from labseq.session.provenance import plugins_of
 from labseq.session.resume import is_over
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop, is_running
@@ -80,7 +79,7 @@ def check_campaign(campaign: Campaign, *, in_turn: bool) -> CampaignInputs:
 
 
 def _plugins(assembly: Any) -> set[tuple[str, ...]]:
-    return {tuple(plugin.values()) for plugin in plugins_of(assembly)}
+    return {(plugin.name, plugin.origin, plugin.version) for plugin in assembly.hardware.host.used()}
 
 
 @contextmanager

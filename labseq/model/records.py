@@ -295,7 +295,7 @@ class RunRecord:
             it was typed.
         units: SI units of what was set and scanned: address -> unit; without those that have none.
         devices: ``describe()`` of each device: role -> values.
-        plugins: Name, version and origin of each plugin that was used.
+        plugins: Each plugin that is used, by :class:`labseq.session.sources.RunCode`.
         provenance: Code and package versions, host, user.
         record_frames: Which frames are kept: "all", "last" or "none".
         grid_spacing_m: Spacing of the sites, in metres.
@@ -321,7 +321,7 @@ class RunRecord:
     resolved: Mapping[str, Any]
     overrides: Mapping[str, Any]
     devices: Mapping[str, Mapping[str, Any]]
-    plugins: tuple[Mapping[str, str], ...]
+    plugins: tuple[Mapping[str, Any], ...]
     provenance: Mapping[str, Any]
     record_frames: Literal["all", "last", "none"]
     grid_spacing_m: float

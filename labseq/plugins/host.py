@@ -7,14 +7,15 @@ import importlib.metadata
 import inspect
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from inspect import signature
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final, Literal, cast
+from typing import Any, Final, Literal, NamedTuple, cast
 
 import pluggy
 
@@ -34,6 +35,9 @@ from labseq.registry import LOAD_S, Entry, Owner, Registry
 
 _MARK: Final = "labseq_impl"  # the attribute that ``hookimpl`` adds to a function
 _HOOKS: Final = [key for key, value in vars(hookspecs).items() if hasattr(value, "labseq_spec")]
+
+_BUILT_IN: Final = "built in"
+_INSTALLED: Final = "installed"
 
 Hooks = dict[str, Callable[..., object]]
 
@@ -167,6 +171,34 @@ class PluginInfo:
     notes: list[str] = field(default_factory=list[str])
 
 
+class UsedPlugin(NamedTuple):
+    """A plugin that something in a run comes from.
+
+    Attributes:
+        name: Its name, as of :class:`PluginInfo`.
+        origin: "built in", "installed" or the absolute path of the file it came from.
+        version: Version of its distribution, or "".
+        home: The file or the folder that its code is in; None if that is not known.
+        offers: What is used of it, for example "planner psca" or "step load"; "observer" for its hooks.
+    """
+
+    name: str
+    origin: str
+    version: str
+    home: Path | None
+    offers: tuple[str, ...]
+
+    @property
+    def is_built_in(self) -> bool:
+        """Whether it is a part of labseq itself."""
+        return self.origin == _BUILT_IN
+
+    @property
+    def is_from_folder(self) -> bool:
+        """Whether it was found in a folder, and is imported again when it is loaded again."""
+        return self.origin not in (_BUILT_IN, _INSTALLED)
+
+
 class _HookManager(pluggy.PluginManager):
     """Looks for hooks only among functions with their mark, which is faster than examining a whole module."""
 
@@ -189,7 +221,7 @@ class PluginHost:
     def __init__(self, max_wait_s: float = LOAD_S) -> None:
         self.registry = Registry(call_plugin)
         self._patience_s = max_wait_s
-        self._used: set[str] = set()
+        self._homes: dict[str, Path | None] = {}
         self._pluggy = _HookManager("labseq")
         self._pluggy.add_hookspecs(hookspecs)
         self._infos: dict[str, PluginInfo] = {}
@@ -202,8 +234,35 @@ class PluginHost:
     @property
     def notes(self) -> list[str]:
         """Text that the plugins in use printed when they were loaded and constructed, a sentence each."""
-        used = [info for info in self._infos.values() if info.name in self._used]
-        return [f"plugin '{info.name}' ({info.source}): {note}" for info in used for note in info.notes]
+        used = {*self.registry.used.values()}
+        infos = [info for info in self._infos.values() if info.name in used]
+        return [f"plugin '{info.name}' ({info.source}): {note}" for info in infos for note in info.notes]
+
+    def used(self, also: Collection[str] = ()) -> list[UsedPlugin]:
+        """The plugins that files name, that these build on, or that observe runs, in the order of loading.
+
+        Args:
+            also: Names of others that are wanted; one that another plugin builds on is not known to be used
+                before that is constructed.
+        """
+        offers = defaultdict[str, set[str]](set, {name: set[str]() for name in also})
+        for (kind, name), origin in self.registry.used.items():
+            offers[origin].add(f"{kind} {name}")
+        for hook in _HOOKS:
+            for implementation in getattr(self._pluggy.hook, hook).get_hookimpls():
+                if hook != "labseq_register":
+                    offers[implementation.plugin_name].add("observer")
+        return [
+            UsedPlugin(
+                info.name,
+                info.origin if info.origin in (_BUILT_IN, _INSTALLED) else str(Path(info.origin).absolute()),
+                info.version,
+                self._homes.get(info.name),
+                tuple(sorted(offers[info.name])),
+            )
+            for info in self._infos.values()
+            if info.name in offers
+        ]
 
     def unused(self) -> list[PluginInfo]:
         """The plugins in ``./plugins`` that were not loaded, because nothing names the folder."""
@@ -218,7 +277,7 @@ class PluginHost:
 
     def load_builtin(self, module: ModuleType) -> None:
         """Register a module of labseq itself; its failure is a bug in labseq and raises."""
-        info = PluginInfo(module.__name__, "built in", __version__)
+        info = PluginInfo(module.__name__, _BUILT_IN, __version__)
         self._run_code(info, None, lambda: module)
         self._infos[info.name] = info
 
@@ -227,7 +286,7 @@ class PluginHost:
         for point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
             name, version = ("", "") if point.dist is None else name_and_version(point.dist)
             source = f"the distribution {name or 'unknown'} {version}".rstrip()
-            info = PluginInfo(point.name, "installed", version, source=source)
+            info = PluginInfo(point.name, _INSTALLED, version, source=source)
             self._load(info, module_location(point.value.partition(":")[0]), point.load)
 
     def load_folders(self, folders: Sequence[Path]) -> None:
@@ -276,7 +335,7 @@ class PluginHost:
         if info.name in self._infos:
             taken = self._infos[info.name]
             other_plugin = f"the plugin in {taken.origin}"
-            if taken.origin == "installed":
+            if taken.origin == _INSTALLED:
                 other_plugin = f"an installed plugin (of {taken.source})"
             reason = f"{other_plugin} is already called '{info.name}'; rename one of them"
             info = replace(info, name=f"{info.name} ({info.source})", state="failed", reason=reason)
@@ -296,6 +355,7 @@ class PluginHost:
             home: The file or the folder that its code is in; None if that is not known.
             importing: Imports it.
         """
+        self._homes[info.name] = home
         owner = Owner(info.name, info.source, home, self._patience_s, info.notes)
         with self.registry.opened_for(owner) as registry:
 
@@ -336,7 +396,7 @@ class PluginHost:
         entry = self.registry.find(kind, name)
         if entry is None:
             raise self._unknown(kind, name, file)
-        self._used.add(entry.origin)  # only of plugins in use, a note says what they printed
+        self.registry.used[kind, name] = entry.origin
         return entry
 
     def _unknown(self, kind: str, name: str, file: Path | None) -> LabseqError:

@@ -30,6 +30,8 @@ NOTIFY_FILE: Final = "notify.yaml"
 """In the data folder: who is told of failures, alarms and the end of the queue."""
 NOTES_FILE: Final = "notes.json"
 """Note and tags, see :mod:`labseq.recording.notes`; exists only if there are any."""
+SOURCES_FILE: Final = "sources.zip"
+"""The sources of the plugins that the run uses."""
 LOCK_FILE: Final = ".lock"
 """Locked by the process that resumes or repairs the run."""
 

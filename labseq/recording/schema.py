@@ -234,7 +234,7 @@ RUN_TEXTS: Final = _fields(
     resolved    json  every setting after defaults and overrides, SI
     overrides   json  what --set and other options changed: address -> value, SI; unit; as written
     units       json  SI units of what was set and scanned: address -> unit
-    plugins     json  name, version and origin of each plugin that was used
+    plugins     json  each plugin that was used: name, version, origin, digest and commit of its sources
     devices     json  what each device reports about itself, SI: role -> values
     provenance  json  where the run comes from: versions, commits, host, user
     """,

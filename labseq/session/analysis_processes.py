@@ -26,6 +26,7 @@ from labseq.recording.results import (
     shots_with_result,
 )
 from labseq.roles import RunObserver
+from labseq.session.checks import Analyses
 from labseq.units import format_quantity
 
 USE: Final = "use"
@@ -50,7 +51,7 @@ Rows = Mapping[int, Mapping[str, Any]]
 """Index of a shot -> its row in the results of an analysis."""
 
 
-class AnalysisProcesses:
+class AnalysisProcesses(Analyses):
     """The analyses of a run's shots: they neither stop nor slow it, unless it needs their results.
 
     An adaptive scan or a check may need a result: the run then waits for it between two shots. The results
@@ -63,9 +64,6 @@ class AnalysisProcesses:
         observer: Receives warnings and the results that are used.
         stop: The request to stop, which ends a wait.
         run: The run, if it is resumed.
-
-    Attributes:
-        values: Quantity -> shot -> value; None for a shot without one.
     """
 
     def __init__(
@@ -76,6 +74,7 @@ class AnalysisProcesses:
         stop: StopFlag,
         run: Run | None = None,
     ) -> None:
+        super().__init__()
         self._analyses = analyses
         self._needed = {name: why for name, why in needed.items() if name.startswith(PREFIX)}
         self._analysis = {name: _analysis_of(name, analyses) for name in self._needed}
@@ -86,7 +85,7 @@ class AnalysisProcesses:
         self._processes: dict[str, _AnalysisProcess] = {}
         self._unwritten: list[Mapping[str, Any]] = []
         self._warned: set[tuple[str, str]] = set()
-        self.values: dict[str, dict[int, float | None]] = {name: {} for name in self._needed}
+        self.values = {name: {} for name in self._needed}
         for event in run.events if run is not None and self._needed else ():
             used = event["values"] if event["event"] == _USED else {}
             if used.get("quantity") in self.values:

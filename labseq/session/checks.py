@@ -16,10 +16,38 @@ from labseq.errors import CheckFailedError
 from labseq.model import TargetPattern
 from labseq.recording.index import IndexRow
 from labseq.recording.results import PREFIX
-from labseq.session.analysis_processes import AnalysisProcesses
 
 if TYPE_CHECKING:
     from labseq.data.quantities import Quantity
+
+
+class Analyses:
+    """The analyses of a run's shots: of a run that has none; see :class:`AnalysisProcesses`.
+
+    Attributes:
+        values: Quantity -> shot -> value; None for a shot without one.
+    """
+
+    def __init__(self) -> None:
+        self.values: dict[str, dict[int, float | None]] = {}
+
+    def start(self, run_dir: Path) -> None:
+        """Start them; from now on results are taken from these."""
+
+    def look(self) -> None:
+        """Warn once about each analysis that has failed; fast enough to call between shots."""
+
+    def finish(self) -> None:
+        """After the run: give each analysis time for the remaining shots, then report missing results."""
+
+    def await_shots(self, name: str, shots: Sequence[int]) -> None:
+        """Wait until the values of a quantity are known, if it is a result.
+
+        Raises:
+            DeviceError: The analysis has ended, and the run cannot go on without it.
+            RecordingError: Its results cannot be read.
+            StopRequested: The run was asked to stop.
+        """
 
 
 class Checks:
@@ -42,7 +70,7 @@ class Checks:
         run_dir: Path,
         rows: Iterable[IndexRow],
         target: TargetPattern,
-        analyses: AnalysisProcesses,
+        analyses: Analyses,
         warn: Callable[[str], None],
     ) -> None:
         self._checks = [
@@ -99,7 +127,7 @@ class Checks:
         return broken
 
 
-def _quantity(check: CheckSettings, target: TargetPattern, analyses: AnalysisProcesses) -> Quantity:
+def _quantity(check: CheckSettings, target: TargetPattern, analyses: Analyses) -> Quantity:
     from labseq.data.quantities import make_quantity  # a run without checks does not need it
 
     return make_quantity(check.value, target, analyses.values)

@@ -18,7 +18,7 @@ from labseq.guard import StopFlag
 from labseq.recording.index import IndexRow
 from labseq.roles import RunObserver
 from labseq.sequencer.lab import Lab
-from labseq.session.analysis_processes import AnalysisProcesses
+from labseq.session.checks import Analyses
 from labseq.session.observers import Observers
 
 
@@ -147,7 +147,7 @@ class PreparedRun:
         self.seed = secrets.randbits(63) if seed is None else seed
         self.stop_flag = StopFlag()
         self.observers = Observers(assembly.hardware.host, observer)
-        self.analyses = self._analysis_processes(run)
+        self.analyses = self._analysis_processes(run) if assembly.sequence.analysis else Analyses()
         self.history = History(assembly, self.seed, run, done)
         self.points: Points = ListedPoints(assembly)
         if assembly.search is not None:
@@ -173,8 +173,10 @@ class PreparedRun:
         """Report a warning."""
         self.observers.event("warning", {"text": text})
 
-    def _analysis_processes(self, run: Run | None) -> AnalysisProcesses:
+    def _analysis_processes(self, run: Run | None) -> Analyses:
         """The analyses of the sequence, and what the run needs of their results."""
+        from labseq.session.analysis_processes import AnalysisProcesses  # loads what other runs do not need
+
         checks, search = self.assembly.sequence.policy.checks, self.assembly.search
         needed = {check.value: "" for check in checks}
         needed |= {check.value: "for a check that stops it" for check in checks if check.then == "stop"}

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import functools
 import getpass
-import hashlib
 import os
 import platform
-import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Collection, Mapping, Sequence
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import labseq
 from labseq.assembly.options import NOT_SET
@@ -26,14 +23,13 @@ from labseq.model.records import RunStatus, unique_names
 from labseq.plain import now_utc
 from labseq.plugins.host import name_and_version
 from labseq.recording.folders import NOTES_FILE
+from labseq.session.sources import RunCode, gather_code
 from labseq.settings import si_unit_at
 from labseq.units import si_unit_of
 
 if TYPE_CHECKING:
     from labseq.assembly.assemble import Assembly
     from labseq.registry import Entry
-
-_GIT_TIMEOUT_S: Final = 5.0
 
 
 class Setting(NamedTuple):
@@ -50,21 +46,15 @@ class Setting(NamedTuple):
     written: str
 
 
-def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
+def gather_provenance(git: Mapping[str, Any]) -> dict[str, Any]:
     """Collect versions, git commits, host and packages, which identify the code that made the data.
 
     Args:
-        sequence_folder: Folder of the sequence; its repository is recorded in addition to
-            that of labseq's own code.
+        git: States of the repositories of labseq's own code and of the sequence.
 
     Returns:
-        JSON-ready values: labseq, python, platform, host, user, git (of the code
-        and of the sequence, with whether uncommitted changes were there), packages.
+        JSON-ready values: labseq, python, platform, host, user, git, packages.
     """
-    with ThreadPoolExecutor(2) as threads:  # git takes longer than the rest of this function
-        code = threads.submit(git_state, Path(labseq.__file__).parent, of="__init__.py")
-        sequence = threads.submit(git_state, sequence_folder)
-        packages = dict(_packages())
     return {
         "labseq": labseq.__version__,
         "python": sys.version.split()[0],
@@ -72,47 +62,9 @@ def gather_provenance(sequence_folder: Path) -> dict[str, Any]:
         "host": platform.node(),
         "user": _user(),
         "pid": os.getpid(),
-        "git": {"code": code.result(), "sequence": sequence.result()},
-        "packages": packages,
+        "git": git,
+        "packages": dict(_packages()),
     }
-
-
-def git_state(folder: Path, of: str = "") -> dict[str, Any] | None:
-    """Commit of the repository that a folder is in, and how tracked files differ from it.
-
-    Args:
-        of: A file in it that must be tracked by the repository. A package installed in an
-            environment inside a repository is not part of that repository.
-
-    Returns:
-        ``{"commit": str, "dirty": bool, "code_sha256": str}``, or None outside of a repository or
-        where git is not installed. ``dirty`` is whether any tracked file differs; ``code_sha256``
-        is the digest of the changes to Python files, "" if there are none.
-    """
-    if of and _git(folder, "ls-files", "--error-unmatch", of) is None:
-        return None
-    lines = (_git(folder, "status", "--porcelain=v2", "--branch", "--untracked-files=no") or "").splitlines()
-    commit = next((line.split()[-1] for line in lines if line.startswith("# branch.oid")), "(initial)")
-    if commit == "(initial)":
-        return None
-    changes = [line for line in lines if not line.startswith("#")]
-    code = _git(folder, "diff", "--no-ext-diff", "--no-color", "HEAD", "--", ":(top)*.py") if changes else ""
-    digest = hashlib.sha256(code.encode()).hexdigest() if code else ""
-    return {"commit": commit, "dirty": bool(changes), "code_sha256": digest}
-
-
-def _git(folder: Path, *arguments: str) -> str | None:
-    try:
-        done = subprocess.run(  # noqa: S603 - fixed arguments, no shell
-            ["git", "--no-optional-locks", "-C", str(folder), *arguments],  # noqa: S607 - the user's own git
-            capture_output=True,
-            check=True,
-            timeout=_GIT_TIMEOUT_S,
-            stdin=subprocess.DEVNULL,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.decode(errors="replace").strip()
 
 
 @functools.cache
@@ -129,12 +81,20 @@ def _user() -> str:
         return ""
 
 
-def run_record(assembly: Assembly, seed: int, changes: Mapping[str, str], folder: Path) -> RunRecord:
+def code_of(assembly: Assembly, folder: Path, also: Collection[str] = ()) -> RunCode:
+    """The code of a run; ``folder`` is the working folder; for ``also`` see :func:`gather_code`."""
+    return gather_code(assembly.hardware.host, (folder / assembly.document.path).parent, also)
+
+
+def run_record(
+    assembly: Assembly, seed: int, changes: Mapping[str, str], folder: Path, code: RunCode
+) -> RunRecord:
     """The record of a run before anything is opened.
 
     Args:
         changes: Changes by options, as they were typed: address -> value.
         folder: The working folder, absolute: relative paths in the settings are relative to it.
+        code: Its code.
     """
     spec, hardware = assembly.sequence, assembly.hardware
     changed = {address: _setting(assembly, address, text) for address, text in changes.items()}
@@ -155,8 +115,8 @@ def run_record(assembly: Assembly, seed: int, changes: Mapping[str, str], folder
         overrides={address: setting._asdict() for address, setting in changed.items()},
         units={address: one.unit for address, one in (changed | at_points).items() if one.unit},
         devices={},
-        plugins=plugins_of(assembly),
-        provenance=gather_provenance((folder / assembly.document.path).parent) | {"folder": str(folder)},
+        plugins=code.plugins,
+        provenance=gather_provenance(code.git) | {"folder": str(folder)},
         record_frames=spec.record_frames,
         grid_spacing_m=hardware.grid.spacing_m,
         lattice=hardware.grid.lattice,
@@ -242,15 +202,3 @@ def ending(error: BaseException | None) -> tuple[RunStatus, str]:
         return "stopped", str(error)
     status: RunStatus = "stopped" if isinstance(error, KeyboardInterrupt) else "failed"
     return status, format_error(error)
-
-
-def plugins_of(assembly: Assembly) -> tuple[dict[str, str], ...]:
-    """Name, origin and version of each plugin that a run uses."""
-    used = [*assembly.hardware.chosen.values(), assembly.planner]
-    used += [] if assembly.search is None else [assembly.search.chosen]
-    origins = {item.entry.origin for item in used}
-    return tuple(
-        {"name": info.name, "origin": info.origin, "version": info.version}
-        for info in assembly.hardware.host.infos
-        if info.name in origins
-    )

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-import json
-import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self, cast
+from typing import Final, Self
 
 from labseq.assembly.assemble import Assembly, assemble_recorded
 from labseq.assembly.options import Options
 from labseq.assembly.recorded import files_of
 from labseq.data import Run, open_run
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.files import LineLog, explained
+from labseq.files import LineLog, explained, write_file
 from labseq.guard import StopFlag
 from labseq.messages import visible
 from labseq.model import RunRecord
-from labseq.plain import dumps, now_utc
+from labseq.plain import now_utc
 from labseq.processes import Lock, knows_no_locks
 from labseq.recording import RunWriter
-from labseq.recording.folders import INDEX_FILE, LOCK_FILE, RUN_FILE, find_run
+from labseq.recording.folders import INDEX_FILE, LOCK_FILE, RUN_FILE, SOURCES_FILE, find_run
 from labseq.recording.index import IndexRow
-from labseq.recording.run_file import SCANNER, encode_run, read_owner, read_run, read_state, read_state_file
-from labseq.session.provenance import run_record
+from labseq.recording.run_file import SCANNER, read_owner, read_run, read_state, read_state_file
+from labseq.session.changes import Change, changes_between, code_changes, differences, record_today
+from labseq.session.sources import RunCode
 from labseq.text_files import decode, read_bytes
 
 _DAY: Final = re.compile(r"\d{4}-\d\d-\d\d")
@@ -147,22 +146,23 @@ class ResumableRun:
             ConfigError: A change is not accepted, or the remaining shots would be different ones.
         """
         record, folder = self.run.record, self.run.path
-        today = run_record(assembly, self.run.seed, options.changes(), Path.cwd())
+        today = record_today(self.run, assembly, options.changes())
         for what in ("n_shots", "scan", "target"):
-            if found := differences(record, today, what):
-                raise _refused(folder, f"its shots would differ today: {found[0]}")
-        self.changes += tuple(changes_between(record, today))
+            if changes := differences(record, today, what):
+                raise _refused(folder, f"its shots would differ today: {changes[0]}")
+        self.changes += tuple(changes_between(self.run, today))
         if self.changes and not accept:
             problems = [Problem(str(change), str(folder)) for change in self.changes]
             what = "this has changed since the run was begun"
             hint = "'labseq resume --accept-changes' continues anyway, and records the changes"
             raise ConfigError([*problems, Problem(what, str(folder), hint=hint)])
 
-    def reopen(self, record: RunRecord, first_shot: int | None, stop: StopFlag) -> RunWriter:
-        """Open its folder for writing.
+    def reopen(self, record: RunRecord, code: RunCode, first_shot: int | None, stop: StopFlag) -> RunWriter:
+        """Open its folder for writing, and keep the sources of the plugins there if they have changed.
 
         Args:
             record: The current record of the run.
+            code: The code that it goes on with.
             first_shot: The first shot that is taken; None if none is.
             stop: The request to stop the run.
 
@@ -174,10 +174,15 @@ class ResumableRun:
             before = ": ".join(filter(None, [self.run.status, self.run.error]))
             entry = {"t_utc": now_utc(), "first_shot": first_shot, "before": before}
             changes = [change._asdict() for change in self.changes]
-            resumed += ({**entry, "changes": changes, "provenance": record.provenance},)
+            details = {"changes": changes, "provenance": record.provenance, "plugins": record.plugins}
+            resumed += ({**entry, **details},)
         then = str(self.run.record["t_start_utc"])
         record = replace(record, t_start_utc=then, resumed=resumed)
-        return RunWriter.reopen(self.run.path, record, n_written=len(self.rows), stop=stop)
+        writer = RunWriter.reopen(self.run.path, record, n_written=len(self.rows), stop=stop)
+        if code_changes(self.run, record):
+            path = self.run.path / SOURCES_FILE
+            write_file(path.with_stem(f"{path.stem}_{len(resumed)}"), code.archive)
+        return writer
 
 
 def is_over(run: Run) -> str:
@@ -240,96 +245,3 @@ def reopened(path: Path, *, accept_changes: bool, realtime: bool) -> tuple[Assem
         earlier.release()
         raise
     return assembly, options, earlier
-
-
-_MAX_TEXT: Final = 60
-
-
-class Change(NamedTuple):
-    """A difference between the run at its start and today.
-
-    Attributes:
-        what: The changed item, for example an address.
-        was: Its value when the run was begun.
-        now: Its value today.
-    """
-
-    what: str
-    was: str
-    now: str
-
-    def __str__(self) -> str:
-        return f"{self.what} was {self.was}, is {self.now}"
-
-
-def changes_between(then: Mapping[str, Any], today: RunRecord) -> list[Change]:
-    """The changes in code, plugins, calibrations and settings between two records of a run."""
-    folder, now = then["provenance"].get("folder"), plain_record(today)
-    return [
-        *_differences(_made_with(then), _made_with(now), folder),
-        *differences(then, today, "resolved"),
-    ]
-
-
-def differences(then: Mapping[str, Any], today: RunRecord, name: str) -> list[Change]:
-    """The changes in one value of run.json, address by address."""
-    before, after = (
-        {address or name: value for address, value in _leaves(record.get(name, {}), "")}
-        for record in (then, plain_record(today))
-    )
-    return _differences(before, after, then["provenance"].get("folder"))
-
-
-def plain_record(record: RunRecord) -> dict[str, Any]:
-    """A run's record as it is in run.json."""
-    return json.loads(encode_run(record, ""))
-
-
-def _made_with(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Versions, code state, plugins and calibrations of a run: name -> value."""
-    provenance = record["provenance"]
-    code = (provenance.get("git") or {}).get("code") or {}
-    found = {"labseq": provenance.get("labseq"), "labseq's commit": code.get("commit")}
-    if code.get("code_sha256"):
-        found["labseq's uncommitted code"] = f"changes with the SHA-256 {code['code_sha256'][:12]}"
-    for plugin in record["plugins"]:
-        found |= {f"plugin {plugin['name']}: {key}": plugin[key] for key in ("origin", "version")}
-    calibrations = record.get("calibrations") or {}
-    return found | {f"the calibration in use of {kind}": entry for kind, entry in calibrations.items()}
-
-
-def _differences(before: Mapping[str, Any], after: Mapping[str, Any], folder: Any) -> list[Change]:
-    return [
-        Change(name, _shown(before, name), _shown(after, name))
-        for name in dict.fromkeys([*before, *after])
-        if (name in before) != (name in after) or not _same(before[name], after[name], folder)
-    ]
-
-
-def _leaves(value: Any, address: str) -> Iterator[tuple[str, Any]]:
-    """Each value of a tree of mappings and lists of mappings, with its address."""
-    items: list[tuple[Any, Any]] = []
-    if isinstance(value, dict):
-        items = list(cast("dict[str, Any]", value).items())
-    elif isinstance(value, list) and any(isinstance(one, dict) for one in cast("list[Any]", value)):
-        items = list(enumerate(cast("list[Any]", value)))
-    if not items:
-        yield address, value
-    for key, one in items:
-        yield from _leaves(one, f"{address}.{key}" if address else str(key))
-
-
-def _shown(values: Mapping[str, Any], name: str) -> str:
-    if name not in values:
-        return "nothing"
-    text = values[name] if isinstance(values[name], str) else dumps(values[name])
-    return text if len(text) <= _MAX_TEXT else f"{text[: _MAX_TEXT - 3]}..."
-
-
-def _same(was: Any, now: Any, folder: Any) -> bool:
-    """Whether two values are the same; each path is relative to the working folder of its record."""
-    if was == now:
-        return True
-    if not (isinstance(was, str) and isinstance(now, str) and isinstance(folder, str)):
-        return False
-    return os.path.normpath(Path(folder) / was) == os.path.normpath(Path.cwd() / now)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import signal
 from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import TracebackType
@@ -21,7 +22,7 @@ from labseq.messages import error_text, visible
 from labseq.model import RunRecord, ShotRecord
 from labseq.realtime import real_time
 from labseq.recording import RunWriter, clear_active, data_root, find_dead_run, mark_active
-from labseq.recording.folders import NOTIFY_FILE, later_day
+from labseq.recording.folders import NOTIFY_FILE, SOURCES_FILE, later_day
 from labseq.recording.index import IndexRow
 from labseq.roles import RunObserver
 from labseq.safety.locks import lock_devices
@@ -31,7 +32,8 @@ from labseq.session.alarms import Alarms
 from labseq.session.check import check
 from labseq.session.checks import Checks
 from labseq.session.prepared import PreparedRun
-from labseq.session.provenance import copies, ending, notes_file, run_record
+from labseq.session.provenance import code_of, copies, ending, notes_file, run_record
+from labseq.session.sources import RunCode
 from labseq.session.stopping import check_stop_file
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
@@ -283,6 +285,7 @@ class Session(PreparedRun):
             self.observers.add(Notices.read())
         for text in () if self.earlier is None else self.earlier.warnings:
             self.warn(text)
+        reading = self._reading_code()
         # before devices are opened: some vendors' libraries change the working folder
         root = (self.earlier.root if self.earlier else self.options.output or data_root()).absolute()
         hardware, purpose = self.assembly.hardware, f"a run of {self.assembly.sequence.name}"
@@ -298,10 +301,10 @@ class Session(PreparedRun):
                 make_safe_after_crash(dead, hardware, self.stop_flag, self.observers)
             first = self.points.next(self.history)
             if first is None:  # its process died between the last shot and the end of the run
-                self._begin(root, first)[1].finish("complete")
+                self._begin(root, first, reading)[1].finish("complete")
             else:
                 lab, warnings = self._checked(first)
-                with self._folder(root, first, describe_locks) as (record, writer):
+                with self._folder(root, first, reading, describe_locks) as (record, writer):
                     for text in dict.fromkeys([*warnings, *hardware.host.notes]):
                         self.warn(text)
                     self._take_shots(lab, first, record, writer)
@@ -349,10 +352,10 @@ class Session(PreparedRun):
 
     @contextmanager
     def _folder(
-        self, root: Path, first: Point, describe_locks: Callable[[str], None]
+        self, root: Path, first: Point, reading: Future[RunCode], describe_locks: Callable[[str], None]
     ) -> Generator[tuple[RunRecord, RunWriter]]:
         """The run's folder, in which the way that the block ends is recorded."""
-        record, writer = self._begin(root, first)
+        record, writer = self._begin(root, first, reading)
         describe_locks(f"the run {writer.run_dir}")
         error: BaseException | None = None
         with self.observers.logged_by(writer.event):
@@ -420,16 +423,28 @@ class Session(PreparedRun):
         self._lost = why
         self.stop_flag.request(signal.SIGTERM)
 
-    def _begin(self, root: Path, first: Point | None) -> tuple[RunRecord, RunWriter]:
+    def _reading_code(self) -> Future[RunCode]:
+        """Read the sources of the plugins and ask git, which takes 0.1 s, while the run is checked."""
+        threads = ThreadPoolExecutor(1)
+        code = threads.submit(code_of, self.assembly, self._cwd)
+        threads.shutdown(wait=False)
+        return code
+
+    def _begin(
+        self, root: Path, first: Point | None, reading: Future[RunCode]
+    ) -> tuple[RunRecord, RunWriter]:
         """Create the run's folder, or reopen that of a resumed run; ``first`` is its next point, if any."""
-        changes, earlier = self.options.changes(), self.earlier
-        record = run_record(self.assembly, self.seed, changes, self._cwd)
+        changes, earlier, code = self.options.changes(), self.earlier, reading.result()
+        if not code.is_of(self.assembly.hardware.host):  # a planner that was constructed uses another's
+            code = code_of(self.assembly, self._cwd)
+        record = run_record(self.assembly, self.seed, changes, self._cwd, code)
         if earlier is None:
             extra_files = copies(self.assembly.hardware.calibrations) | self._notes
+            extra_files |= {SOURCES_FILE: code.archive}
             writer = RunWriter.create(root, record, extra_files, self.stop_flag)
         else:
             first_shot = None if first is None else self.history.to_take[0]
-            writer = earlier.reopen(record, first_shot, self.stop_flag)
+            writer = earlier.reopen(record, code, first_shot, self.stop_flag)
         self.run_dir = writer.run_dir
         return record, writer
 

@@ -11,8 +11,7 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError
-from labseq.session.provenance import run_record
-from labseq.session.resume import changes_between
+from labseq.session.changes import changes_between, record_today
 from labseq.testing.fakes import RecordingObserver
 
 from .small_runs import SEQUENCE, changed, resumed, stopped, stopped_home
@@ -57,11 +56,12 @@ def test_changes_that_are_accepted_are_recorded(stopped: Path) -> None:
 def test_uncommitted_code_is_compared(stopped: Path) -> None:
 
     with labseq.Session.resume(stopped) as session:
-        today = run_record(session.assembly, 5, session.options.changes(), Path.cwd())
-    then = session.earlier.run.record if session.earlier is not None else {}
+        assert session.earlier is not None
+        then = session.earlier.run
+        today = record_today(then, session.assembly, session.options.changes())
 
     def changes(was: Any, now: Any) -> list[str]:
-        then["provenance"]["git"]["code"] = was
+        then.record["provenance"]["git"]["code"] = was
         provenance = {**today.provenance, "git": {"code": now}}
 
         return [str(c) for c in changes_between(then, dataclasses.replace(today, provenance=provenance))]

@@ -188,7 +188,8 @@ def test_long_and_foreign_names(tmp_path: Path) -> None:
 
 def test_a_record_of_a_run_needs_no_present_folder(tmp_path: Path) -> None:
     with labseq.Session.open(write(tmp_path)) as session:
-        record = recording_of.run_record(session.assembly, 1, {}, Path("/then"))
+        code = recording_of.code_of(session.assembly, Path("/then"))
+        record = recording_of.run_record(session.assembly, 1, {}, Path("/then"), code)
     assert isinstance(record, RunRecord)
     assert record.provenance["folder"] == str(Path("/then"))
     assert record.sequence_path == str(tmp_path / "no_scan.yaml")
