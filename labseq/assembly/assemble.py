@@ -28,6 +28,7 @@ from labseq.errors import ConfigError, LabseqError, PluginLoadError, ProblemColl
 from labseq.model import TargetPattern
 from labseq.model.policies import NO_POLICY, RunPolicy, StepPolicy
 from labseq.recording.results import PREFIX
+from labseq.recording.run_file import plain_regions
 from labseq.roles import Context, Step
 from labseq.settings import settings_of
 
@@ -185,12 +186,18 @@ def _assembled(
     is_whole = not problems.problems
     objects: dict[str, Any] = {}
     with problems:
-        objects["target"], objects["target_dump"] = make_target(hardware, document, sequence)
+        pattern, objects["target_dump"] = make_target(hardware, document, sequence)
+        if sequence.regions:
+            from labseq.assembly.regions import with_regions  # loads what other runs do not need
+
+            pattern = with_regions(pattern, hardware, document, sequence.regions)
+        objects["target"] = pattern
     with problems:
         objects["planner"] = resolve(hardware.host, document, "planner", sequence.planner)
     steps, step_dumps = make_steps(hardware, document, sequence, problems)
     analyses, results = make_analyses(hardware, document, sequence, problems)
-    target = objects.get("target")
+    # quantities may name regions, which a file with errors may have lost
+    target = objects.get("target") if is_whole else None
     policy = make_policy(document, sequence, steps, results, target, problems)
     measures = make_measures(document, sequence, steps, target, results, scan, hardware.host, problems)
     scanned: ScanPoints | None = None
@@ -209,7 +216,9 @@ def _assembled(
         raise _explained(error, scan) from None
     target, planner = objects["target"], objects["planner"]
     resolved = {
-        **sequence.model_dump(mode="json", exclude={"shot", "target", "planner", "scan", "measure"}),
+        **sequence.model_dump(
+            mode="json", exclude={"shot", "target", "planner", "scan", "measure", "regions"}
+        ),
         "measure": measures,
         "target": objects["target_dump"],
         "planner": planner.dump(),
@@ -217,6 +226,8 @@ def _assembled(
         "analysis": analyses,
         "profile": _profile_dump(hardware),
     }
+    if target.regions:
+        resolved["regions"] = plain_regions(target)
     if texts := _expressions(document, hardware.document):
         resolved["expressions"] = texts
     parts = (document, sequence, hardware, target, planner, tuple(steps), resolved)

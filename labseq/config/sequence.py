@@ -103,6 +103,27 @@ Measures: TypeAlias = Annotated[
 """What a run measures, the most important first; None to choose it by the steps."""
 
 
+_WORD: Final = re.compile(r"[^\W\d][\w-]*")
+"""Names of steps and regions."""
+
+
+def _check_region_names(regions: dict[str, Any]) -> dict[str, Any]:
+    for name in regions:
+        if name in ("target", "reservoir") or not _WORD.fullmatch(name):
+            what = f"'{clean(name)}' cannot be the name of a region"
+            expected = "a word of letters, digits, '_' and '-', other than target and reservoir"
+            raise setting_error(what, expected, at=(name,), key=True)
+    return regions
+
+
+_Site = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
+_Sites = Annotated[list[_Site], Field(min_length=1)]
+Regions: TypeAlias = Annotated[
+    dict[str, str | _Sites | dict[str, Any]], empty_is({}), AfterValidator(_check_region_names)
+]
+"""Name -> rows and columns as text, a list of sites, or a pattern, which is checked later."""
+
+
 class PolicySettings(Settings):
     """``policy`` of a sequence: reactions to failures, for the run and every step without its own policy."""
 
@@ -146,8 +167,6 @@ Analyses: TypeAlias = Annotated[tuple[AnalysisChoice, ...], empty_is(()), AfterV
 
 DEFAULT_PLANNER: Final = "psca"
 
-_STEP_NAME: Final = re.compile(r"[^\W\d][\w-]*")
-
 
 @dataclass(frozen=True, slots=True)
 class StepSpec:
@@ -171,7 +190,7 @@ class StepSpec:
 
 def _step(value: Any) -> StepSpec:
     """Read one item of ``shot``; its index is added later."""
-    if isinstance(value, str) and _STEP_NAME.fullmatch(value):
+    if isinstance(value, str) and _WORD.fullmatch(value):
         raise setting_error(f"a step is just '{value}'", "a mapping", f"write '- {value}: {{}}'")
     if not isinstance(value, dict):
         raise setting_error(f"a step is {shown(value)}", "a mapping such as 'image: {exposure: 45 ms}'")
@@ -189,7 +208,7 @@ def _step(value: Any) -> StepSpec:
         hint = "put a space after the ':'" if ":" in kind else ""
         raise setting_error(f"{clean(kind)} is {shown(settings)}", expected, hint, at=(kind,))
     name = item.get("name", "")
-    if "name" in item and not (isinstance(name, str) and _STEP_NAME.fullmatch(name)):
+    if "name" in item and not (isinstance(name, str) and _WORD.fullmatch(name)):
         expected = "a word of letters, digits, '_' and '-' that begins with a letter"
         raise setting_error(f"the name of the step is {shown(name)}", expected, at=("name",))
     return StepSpec(kind, cast("str", name), (kind,))
@@ -250,6 +269,11 @@ class SequenceSpec(Settings):
         default=None,
         description="the quantities that the run is about, the most important first; "
         "by default `filling` and `defect_free` with a target, else the survival between the last two images",
+    )
+    regions: Regions = Field(
+        default={},
+        description="named sets of sites for quantities (`filling@corner`): rows and columns `'0:4,0:4'`, "
+        "a list of sites `[[0, 0], [3, 5]]`, or a pattern as a target has it, such as a drawing",
     )
     variables: Variables = Field(default={}, description="numbers and quantities that expressions refer to")
     analysis: Analyses = Field(default=(), description="analyses of each shot, in parallel to the run")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from labseq.data.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, columns_of, quantities_in
 from labseq.data.shot import Shot
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.messages import clean, closest
+from labseq.messages import clean, closest, did_you_mean
 from labseq.model import TargetPattern
 from labseq.model.estimate import Estimated, Rate, mean
 from labseq.model.image_quantities import (
@@ -168,7 +168,7 @@ def _sites_problem(name: str, sites: str, target: TargetPattern) -> tuple[str, s
     try:
         mask = mask_of(sites, target)
     except ValueError as error:
-        return clean(str(error)), SITES, ""
+        return clean(str(error)), SITES, did_you_mean(sites, ["target", "reservoir", *target.regions])
     if parse_name(name).kind == "filling" and not target.is_none and not (mask & target.fill).any():
         return f"no site of '{clean(name)}' is one that the target fills", SITES, ""
     return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self, TypeAlias
 
@@ -159,11 +160,13 @@ class TargetPattern:
         clear: bool (n_rows, n_cols), sites that must be empty. All others are
             reservoir: an atom there does no harm.
         name: For records and the screen.
+        regions: Named sets of sites, bool (n_rows, n_cols), that quantities refer to; they ask nothing.
     """
 
     fill: NDArray[np.bool_]
     clear: NDArray[np.bool_]
     name: str = "target"
+    regions: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict[str, NDArray[np.bool_]])
 
     def __post_init__(self) -> None:
         shape = np.shape(self.fill)

@@ -21,7 +21,7 @@ Events = tuple[float, float]
 """A value and 1, or a number of events and the number of trials; 0 trials without a value."""
 
 NO_VALUE: Final[Events] = (math.nan, 0.0)
-SITES: Final = "target, reservoir, or ROWS,COLUMNS such as 2:8,3"
+SITES: Final = "target, reservoir, ROWS,COLUMNS such as 2:8,3, or a name under 'regions' in the sequence"
 """What may follow the "@" of a name."""
 
 
@@ -83,6 +83,8 @@ def mask_of(sites: str, target: TargetPattern) -> Occupancy:
         mask = target.fill.copy()
     elif sites == "reservoir":
         mask = ~(target.fill | target.clear)
+    elif sites in target.regions:
+        mask = target.regions[sites].copy()
     elif match := re.fullmatch(r"(\d*)(:?)(\d*)\s*,\s*(\d*)(:?)(\d*)", sites):
         mask[_span(*match.groups()[:3]), _span(*match.groups()[3:])] = True
     else:

@@ -129,9 +129,20 @@ def target_of(path: Path, record: Mapping[str, Any]) -> TargetPattern:
     """
     try:
         target = record["target"]
-        return TargetPattern(_grid(target["fill"]), _grid(target["clear"]), str(target["name"]))
+        regions = regions_of(record.get("resolved") or {})
+        return TargetPattern(_grid(target["fill"]), _grid(target["clear"]), str(target["name"]), regions)
     except (KeyError, TypeError, ValueError) as error:
         raise RecordingError(path, f"has a damaged target: {error!r}", "restore it from a backup") from error
+
+
+def regions_of(resolved: Mapping[str, Any]) -> dict[str, NDArray[np.bool_]]:
+    """The regions in the settings of a run; none in runs of earlier versions."""
+    return {name: _grid(rows) for name, rows in resolved.get("regions", {}).items()}
+
+
+def plain_regions(target: TargetPattern) -> dict[str, list[str]]:
+    """The regions of a target as the settings of a run have them: a text of 0 and 1 for each row."""
+    return {name: _rows(mask) for name, mask in target.regions.items()}
 
 
 def _rows(sites: NDArray[np.bool_]) -> list[str]:

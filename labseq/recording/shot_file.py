@@ -35,7 +35,7 @@ from labseq.recording.hdf5 import (
     write_texts,
     write_values,
 )
-from labseq.recording.run_file import check_version, sha256_of_text
+from labseq.recording.run_file import check_version, regions_of, sha256_of_text
 from labseq.text_files import something_else
 
 _AXES: Final = ("t_s", ".", ".")
@@ -221,7 +221,9 @@ def content_of(entry: Any) -> ShotContent:
     """Read a shot's file, :func:`opened`, without its frames."""
     run = read_fields(entry["run"], schema.RUN) | read_texts(entry["run"], schema.RUN_TEXTS)
     fill, clear = (entry[f"target/{name}"][()].astype(np.bool_) for name in ("fill", "clear"))
-    return ShotContent(_record(entry), run, TargetPattern(fill, clear, run["target.name"]))
+    return ShotContent(
+        _record(entry), run, TargetPattern(fill, clear, run["target.name"], regions_of(run["resolved"]))
+    )
 
 
 def read_occupancies(path: Path) -> tuple[list[tuple[int, int, str]], NDArray[np.uint8]]:

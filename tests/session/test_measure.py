@@ -210,3 +210,44 @@ def test_points_that_do_not_follow_or_a_broken_model_do_not_end_it(
     assert sum("the run takes all its shots" in text and warning in text for text in warnings) == bool(
         warning
     )
+
+
+REGIONS = """regions:
+  corner: "0:3,2"
+  two: [[0, 0], [3, 5]]
+  drawn: {pattern: bitmap, sites: "##.\\n.#.", origin: [4, 1]}
+"""
+
+
+def test_named_regions_are_sites_of_quantities(tmp_path: Path) -> None:
+    names = ["loading:before@corner", "loading:before@two", "survival:before,after@drawn"]
+    with opened(
+        tmp_path, HEAD + REGIONS + f"measure: [{', '.join(map(repr, names))}]\n" + SURVIVAL
+    ) as session:
+        run = session.run()
+    for shot in labseq.open_run(run.path).shots:
+        before, after = shot.occupancies
+        drawn = np.zeros(before.shape, np.bool_)
+        drawn[4, 1:3] = drawn[5, 2] = True
+        values = [shot.row.measured[name] for name in names]
+        expected = (np.sum(before & after & drawn), np.sum(before & drawn))
+        assert values == [(before[:3, 2].mean(), 1), (before[[0, 3], [0, 5]].mean(), 1), expected]
+        assert run.quantity("loading:before@drawn").of_shot(shot) == before[drawn].mean()
+
+
+@pytest.mark.parametrize(
+    ("regions", "expected"),
+    [
+        ("{left: '30,:'}", "5:17: there are no sites '30,:' (of 20 x 20)"),
+        ("{left: [[0, 30]]}", "5:18: [0, 30] is not a site of the grid of 20 x 20"),
+        ("{left: [[0]]}", "5:18: left.0 has 1 "),
+        ("{left: {pattern: bitmap, sites: '...'}}", "5:"),
+        ("{left: {pattern: compact, rows: 30, cols: 2}}", "5:17: "),
+        ("{target: '1,1'}", "5:11: 'target' cannot be the name of a region"),
+        ("{left: 'a b'}", "5:17: 'a b' names no sites"),
+    ],
+)
+def test_a_wrong_region_is_one_error(tmp_path: Path, regions: str, expected: str) -> None:
+    text = message(tmp_path, HEAD + f"regions: {regions}\nmeasure: [loading@left]\n" + SURVIVAL)
+    assert text.startswith(expected)
+    assert "\n" not in text
