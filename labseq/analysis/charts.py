@@ -45,6 +45,8 @@ N_BINS: Final = 80
 """Number of bars in the histogram of signals."""
 COLOURS: Final = "cividis"
 """Colour map of fractions: its lightness rises evenly, for every kind of colour vision and in print."""
+DIVERGING: Final = "RdBu"
+"""Colour map of deviations: red below, white at 0, blue above."""
 NO_VALUE: Final = "0.94"
 """Grey of a cell without a value."""
 MANY_BARS: Final = 15
@@ -250,28 +252,39 @@ def draw_map(
 
 
 def draw_sites(
-    axes: Axes, *, title: str, label: str, grid: SiteGrid, values: Floats, outlined: NDArray[np.bool_]
+    axes: Axes,
+    *,
+    title: str,
+    label: str,
+    grid: SiteGrid,
+    values: Floats,
+    outlined: NDArray[np.bool_],
+    limit: float = 0.0,
 ) -> None:
     """Draw a fraction for each site, in its cell.
 
     Args:
         values: float64 (n_rows, n_cols), fractions; NaN if unknown.
         outlined: bool (n_rows, n_cols), the target, around which a line is drawn.
+        limit: For deviations instead of fractions: drawn from minus this to this.
     """
     from matplotlib import colormaps
     from matplotlib.collections import LineCollection, PolyCollection
 
     rows, cols = np.indices(values.shape)
     cells = place_sites(np.stack([rows.ravel(), cols.ravel()], axis=1), grid)[:, None] + cell(grid)
-    colours = colormaps[COLOURS].with_extremes(bad=NO_VALUE, under="black")
+    fractions = colormaps[COLOURS].with_extremes(bad=NO_VALUE, under="black")
+    # the colour of no deviation is nearly white
+    colours = colormaps[DIVERGING].with_extremes(bad="0.7") if limit else fractions
     filled = PolyCollection(list(cells), cmap=colours, edgecolors="white", linewidths=0.3)
-    filled.set_array(np.ma.masked_invalid(100 * values.ravel()))
+    scale = 1.0 if limit else 100.0
+    filled.set_array(np.ma.masked_invalid(scale * values.ravel()))
     finite = values[np.isfinite(values)]
-    low, high = 0.0, 1.0
-    if len(finite):  # a site with few atoms must not stretch the range
+    low, high = (-limit, limit) if limit else (0.0, 1.0)
+    if len(finite) and not limit:  # a site with few atoms must not stretch the range
         high = float(finite.max())
         low = min(float(np.quantile(finite, 0.02)), high - 0.01)
-    filled.set_clim(100 * low, 100 * high)
+    filled.set_clim(scale * low, scale * high)
     axes.add_collection(filled)
     line: dict[str, Any] = {"colors": RED, "linewidths": 1.0, "capstyle": "round"}
     axes.add_collection(LineCollection(list(outline(outlined, grid)), **line))

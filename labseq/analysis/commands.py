@@ -34,6 +34,7 @@ Examples:
   labseq plot
   labseq plot data/2026-11-21/0004_scan-dop --what scan -o scan.pdf
   labseq plot --scan survival:before,after --fit exponential
+  labseq plot --map survival:before,after
   labseq plot --shot 3
   labseq plot --shot 3 --cycle 1 -o first_cycle.svg
 """
@@ -158,6 +159,15 @@ def plot(
         ),
     ] = None,
     scan: ScanQuantities = None,
+    sites: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map",
+            metavar="[QUANTITY]",
+            help="A quantity of the images at each site: survival:before,after, loading, filling or "
+            "defect_free; default: what the run measures. May be given several times.",
+        ),
+    ] = None,
     where: Where = None,
     fit: FitName = None,
     fit_set: FitSettings = None,
@@ -172,5 +182,6 @@ def plot(
     from labseq.analysis.scanned import scan_request
     from labseq.analysis.terminal import PlotRequest, plot_run
 
-    request = PlotRequest(what, shot, cycle, scan_request(scan, fit, fit_set, along), tuple(where or ()))
+    scanned = scan_request(scan, fit, fit_set, along)
+    request = PlotRequest(what, shot, cycle, scanned, tuple(sites or ()), tuple(where or ()))
     plot_run(run, request, output, replace=force)

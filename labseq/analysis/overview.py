@@ -43,11 +43,13 @@ from labseq.data.fits import Fit, readable
 from labseq.data.images import loading_map
 from labseq.data.quantities import WITH_TARGET, Quantity, measured_by, quantity_of, steps_that_load
 from labseq.data.scanned import FitAt, Scanned, is_geometric, scanned
+from labseq.data.site_maps import SiteMap, site_map
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites
 from labseq.errors import ConfigError, Problem, RecordingError, one_of
 from labseq.messages import clean, visible
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.estimate import Estimate, Estimated, Rate
+from labseq.model.image_quantities import OF_IMAGES, parse_name
 from labseq.pictures.figures import make_figure, save_figure
 from labseq.roles import Context
 from labseq.units import factor_of
@@ -367,6 +369,52 @@ def scan_picture(run: Run, request: ScanRequest) -> RunPicture:
     ]
     panels = [panel for row in rows for panel in row]
     return _picture(run, "the scan", [tuple(panels)] if len(panels) <= MAX_PANELS else rows)
+
+
+def map_picture(run: Run, names: Sequence[str]) -> RunPicture:
+    """Quantities of the images at each site, and how far each site is from the mean.
+
+    Args:
+        run: The run.
+        names: The quantities; none for those that the run measures.
+
+    Raises:
+        ConfigError: There is no such quantity, or it is not one of sites.
+    """
+    of_sites = [name for name in measured_by(run) if parse_name(name).kind in OF_IMAGES]
+    shots = evenly(_with_shots(run).shots, PART_SHOTS)
+    rows = [_map_panels(run, site_map(run, name, shots)) for name in names or of_sites]
+    if not rows:
+        raise cannot_draw(run, "it measures no quantity of its images", "--map QUANTITY")
+    return _picture(run, "quantities by site", rows)
+
+
+def _map_panels(run: Run, sites: SiteMap) -> Row:
+    title = clean(sites.name)
+    if not sites.n_trials.any():
+        raise cannot_draw(run, f"no shot has a value of '{title}'", "readable shots with its images")
+    n_trials = sites.n_trials[sites.n_trials > 0]
+    unit = "atom" if parse_name(sites.name).kind == "survival" else "shot"
+    each = f"{n_trials.min()}" if np.ptp(n_trials) == 0 else f"{n_trials.min()} to {n_trials.max()}"
+    share = f"{100 * sites.n.sum() / n_trials.sum():.1f} %"
+    site: dict[str, Any] = {"grid": grid_of(run), "outlined": run.target.fill}
+    return (
+        partial(
+            draw_sites,
+            title=f"{title}: {share}\n{each} {unit}s a site{part_text(sites.n_shots, run)}",
+            label=f"{title} (%)",
+            values=sites.values,
+            **site,
+        ),
+        partial(
+            draw_sites,
+            title="difference to the mean,\nin errors of the site",
+            label="standard errors",
+            values=sites.deviations,
+            limit=max(3.0, float(np.nanmax(np.abs(sites.deviations), initial=0.0))),
+            **site,
+        ),
+    )
 
 
 class _Summary:

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from labseq.analysis.campaigns import campaign_in, campaign_picture
-from labseq.analysis.overview import overview, picture_of, scan_picture
+from labseq.analysis.overview import map_picture, overview, picture_of, scan_picture
 from labseq.analysis.replay import (
     PlanCounts,
     Replay,
@@ -312,13 +312,14 @@ def _report(outcome: AnalysisOutcome) -> None:
 
 @dataclass(frozen=True, slots=True)
 class PlotRequest:
-    """The part of a run to draw; at most one of ``what``, ``scan`` and ``shot`` is given.
+    """The part of a run to draw; at most one of ``what``, ``scan``, ``sites`` and ``shot`` is given.
 
     Attributes:
         what: A part of the overview; None for all of it.
         shot: A shot, counted from 0.
         cycle: A cycle of it, counted from 0.
         scan: Quantities at the points of the scan.
+        sites: Quantities at each site; "" for those that the run measures.
         where: Conditions on the shots that are drawn.
     """
 
@@ -326,6 +327,7 @@ class PlotRequest:
     shot: int | None = None
     cycle: int | None = None
     scan: ScanRequest | None = None
+    sites: tuple[str, ...] = ()
     where: tuple[str, ...] = ()
 
     def check(self) -> None:
@@ -334,7 +336,8 @@ class PlotRequest:
         Raises:
             ConfigError: Options conflict, or there is no such picture.
         """
-        pictures = {"--what": self.what, "--shot": self.shot, "--scan": self.scan}
+        maps = self.sites or None
+        pictures = {"--what": self.what, "--shot": self.shot, "--scan": self.scan, "--map": maps}
         options = [option for option, value in pictures.items() if value is not None]
         if len(options) > 1:
             problem = "these are different pictures"
@@ -352,7 +355,7 @@ class PlotRequest:
         """
         if self.shot is not None:
             return f"shot-{self.shot}" + (f"-cycle-{self.cycle}" if self.cycle is not None else "")
-        return "scan" if self.scan is not None else self.what or "overview"
+        return "scan" if self.scan is not None else "map" if self.sites else self.what or "overview"
 
 
 def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, replace: bool = False) -> None:
@@ -380,6 +383,8 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, rep
         save_shot(path, shot_picture(opened_run, request.shot, request.cycle))
     elif request.scan is not None:
         scan_picture(opened_run, request.scan).save(path)
+    elif request.sites:
+        map_picture(opened_run, [*filter(None, request.sites)]).save(path)
     else:
         (overview(opened_run) if request.what is None else picture_of(opened_run, request.what)).save(path)
     say(f"written: {path}")

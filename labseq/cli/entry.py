@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def arrange(arguments: Sequence[str]) -> list[str]:
-    """Give ``--dry-run`` and ``--scan`` their values and move ``--debug`` to the front.
+    """Give ``--dry-run``, ``--scan`` and ``--map`` their values and move ``--debug`` to the front.
 
     typer has no options with an optional value, and accepts global options only before
     the command. Arguments after ``--`` are unchanged.
@@ -67,7 +67,9 @@ def arrange(arguments: Sequence[str]) -> list[str]:
     values = {} if command == "doctor" else {"--dry-run": "--dry-run=full"}
     follows = [*options[1:], "-"][: len(options)]
     values_of = (
-        "--scan=" if option == "--scan" and _is_no_quantity(following) else values.get(option, option)
+        f"{option}="
+        if option in ("--scan", "--map") and _is_no_quantity(following)
+        else values.get(option, option)
         for option, following in zip(options, follows, strict=True)
         if option != "--debug"
     )
@@ -75,7 +77,7 @@ def arrange(arguments: Sequence[str]) -> list[str]:
 
 
 def _is_no_quantity(argument: str) -> bool:
-    """Whether an argument after ``--scan`` is another option, or the run: a number, or a path."""
+    """Whether an argument after ``--scan`` or ``--map`` is another option, or the run: a number or a path."""
     if argument.startswith("-") or argument.isdecimal() or {"/", os.sep}.intersection(argument):
         return True
     from labseq.recording.folders import RUN_FILE  # takes 0.3 s with numpy, which the command needs anyway

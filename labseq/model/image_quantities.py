@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from labseq.model.records import CycleRecord, ImageRecord, follow_atoms
 
 Events = tuple[float, float]
 """A value and 1, or a number of events and the number of trials; 0 trials without a value."""
+
+AtSites: TypeAlias = tuple[Occupancy, Occupancy]
+"""Sites where it happened, and where it could: an atom survived, there was one. bool (n_rows, n_cols)."""
 
 NO_VALUE: Final[Events] = (math.nan, 0.0)
 SITES: Final = "target, reservoir, ROWS,COLUMNS such as 2:8,3, or a name under 'regions' in the sequence"
@@ -112,8 +115,16 @@ def events_of(name: str, shot: ImagesOfShot, target: TargetPattern) -> Events:
         shot: The shot.
         target: The target of the run.
     """
+    happened, tried = (int(np.count_nonzero(sites)) for sites in at_sites(name, shot, target))
+    return OF_IMAGES[parse_name(name).kind].sum_up(happened, tried) if tried else NO_VALUE
+
+
+def at_sites(name: str, shot: ImagesOfShot, target: TargetPattern) -> AtSites:
+    """A quantity of a shot's images at each site that counts; arguments as for :func:`events_of`."""
     kind, images, sites = parse_name(name)
-    return OF_IMAGES[kind].events_of(shot, target, mask_of(sites, target), *images)
+    mask = mask_of(sites, target)
+    happened, tried = OF_IMAGES[kind].at_sites(shot, target, *images)
+    return happened & mask, tried & mask
 
 
 def find_image(shot: ImagesOfShot, name: str, default: int) -> ImageRecord | None:
@@ -126,37 +137,38 @@ def find_image(shot: ImagesOfShot, name: str, default: int) -> ImageRecord | Non
     return next((image for image in images if image.name == name), None)
 
 
-def _survival(
-    shot: ImagesOfShot, _: TargetPattern, mask: Occupancy, before: str = "", after: str = ""
-) -> Events:
+def _nowhere(target: TargetPattern) -> AtSites:
+    none = np.zeros(target.shape, np.bool_)
+    return none, none
+
+
+def _survival(shot: ImagesOfShot, target: TargetPattern, before: str = "", after: str = "") -> AtSites:
     first, last = find_image(shot, before, 0), find_image(shot, after, -1)
     if first is None or last is None or first.t_start_s >= last.t_start_s:
-        return NO_VALUE
+        return _nowhere(target)
     # an image is taken at the end of its cycle, so that the cycle of the first image does not count
     start, end = (first.step, first.cycle), (last.step, last.cycle)
     cycles = (cycle for cycle in shot.cycles if start < (cycle.step, cycle.cycle) <= end)
-    expected = np.logical_or(*follow_atoms(first.occupancy, cycles)) & mask
-    return int(np.sum(expected & last.occupancy)), int(np.sum(expected))
+    expected = np.logical_or(*follow_atoms(first.occupancy, cycles))
+    return expected & last.occupancy, expected
 
 
-def _loading(shot: ImagesOfShot, _: TargetPattern, mask: Occupancy, name: str = "") -> Events:
+def _loading(shot: ImagesOfShot, target: TargetPattern, name: str = "") -> AtSites:
     image = find_image(shot, name, 0)
-    return NO_VALUE if image is None else (float(image.occupancy[mask].mean()), 1)
+    return _nowhere(target) if image is None else (image.occupancy, np.ones(target.shape, np.bool_))
 
 
-def _filling(shot: ImagesOfShot, target: TargetPattern, mask: Occupancy, name: str = "") -> Events:
-    image, fill = find_image(shot, name, -1), target.fill & mask
-    if image is None or not fill.any():
-        return NO_VALUE
-    return 1 - np.count_nonzero(fill & ~image.occupancy) / np.count_nonzero(fill), 1
-
-
-def _defect_free(shot: ImagesOfShot, target: TargetPattern, mask: Occupancy, name: str = "") -> Events:
+def _filling(shot: ImagesOfShot, target: TargetPattern, name: str = "") -> AtSites:
     image = find_image(shot, name, -1)
-    if image is None or target.is_none:
-        return NO_VALUE
-    wrong = (target.fill & ~image.occupancy) | (target.clear & image.occupancy)
-    return float(not np.any(wrong & mask)), 1
+    return _nowhere(target) if image is None else (target.fill & image.occupancy, target.fill)
+
+
+def _defect_free(shot: ImagesOfShot, target: TargetPattern, name: str = "") -> AtSites:
+    image = find_image(shot, name, -1)
+    if image is None:
+        return _nowhere(target)
+    right = (target.fill & image.occupancy) | (target.clear & ~image.occupancy)
+    return right, target.fill | target.clear
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,13 +179,15 @@ class ImageQuantity:
         about: Its description.
         n_images: Number of images that its name may give.
         is_rate: Whether it counts events in trials: shots are then added up.
-        events_of: Its value: takes a shot, the target, the sites that count and the names of the images.
+        at_sites: Its value at each site: takes a shot, the target and the names of the images.
+        sum_up: The value of a shot from the numbers of sites where it happened and where it could.
     """
 
     about: str
     n_images: int
     is_rate: bool
-    events_of: Callable[..., Events]
+    at_sites: Callable[..., AtSites]
+    sum_up: Callable[[int, int], Events]
 
 
 OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
@@ -183,10 +197,29 @@ OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
         2,
         True,
         _survival,
+        lambda n, n_tried: (n, n_tried),
     ),
-    "filling": ImageQuantity("share of the target's sites with an atom; last image", 1, False, _filling),
-    "defect_free": ImageQuantity("whether the target is met; last image", 1, True, _defect_free),
-    "loading": ImageQuantity("share of all sites with an atom; first image", 1, False, _loading),
+    "filling": ImageQuantity(
+        "share of the target's sites with an atom; last image",
+        1,
+        False,
+        _filling,
+        lambda n, n_tried: (1 - (n_tried - n) / n_tried, 1),
+    ),
+    "defect_free": ImageQuantity(
+        "whether the target is met; last image",
+        1,
+        True,
+        _defect_free,
+        lambda n, n_tried: (float(n == n_tried), 1),
+    ),
+    "loading": ImageQuantity(
+        "share of all sites with an atom; first image",
+        1,
+        False,
+        _loading,
+        lambda n, n_tried: (n / n_tried, 1),
+    ),
 }
 """The kinds, by the beginning of their names."""
 

@@ -11,11 +11,13 @@ import pytest
 from labseq_virtual.flight import KELVIN, draw_atoms
 
 import labseq
+from labseq.analysis.overview import map_picture
 from labseq.cli import main
 from labseq.data.fit_models import MODELS, RB87_U
 from labseq.data.fits import fit_points
 from labseq.data.points import scan_points
 from labseq.data.quantities import select_shots
+from labseq.data.site_maps import site_map
 from labseq.errors import ConfigError
 from labseq.model.estimate import Estimate, Estimated, Rate
 from labseq.model.image_quantities import OF_IMAGES
@@ -185,3 +187,25 @@ def test_the_commands_show_write_and_draw_the_same_points(
     )
     assert (tmp_path / "scan.png").stat().st_size == 0
     assert printed("plot", run, "--scan", "-o", "scan.png", "--force") == "written: scan.png\n"
+
+
+def test_maps_of_sites_add_up_to_the_quantity(lifetime: labseq.Run, tmp_path: Path) -> None:
+    name = "survival:before,after@0:10,:"
+    sites = site_map(lifetime, name)
+    rate = lifetime.quantity(name).over(lifetime.shots)
+    assert (sites.n.sum(), sites.n_trials.sum()) == (rate.n, rate.n_trials)
+    before, after = (np.array([shot.occupancies[i] for shot in lifetime.shots]) for i in (0, -1))
+    assert sites.n_trials[:10] == pytest.approx(before.sum(axis=0)[:10])
+    assert not sites.n_trials[10:].any()
+    is_known = sites.n_trials >= 5
+    assert is_known.any()
+    assert (np.isnan(sites.values) == ~is_known).all()
+    survived = (before & after).sum(axis=0)[is_known] / before.sum(axis=0)[is_known]
+    assert sites.values[is_known] == pytest.approx(survived)
+    # the deviations of sites that are alike scatter by one
+    assert 0.7 < np.nanstd(sites.deviations) < 1.3
+    picture = map_picture(lifetime, [name, "loading"])
+    picture.save(tmp_path / "map.png")
+    assert [len(row) for row in picture.rows] == [2, 2]
+    with pytest.raises(ConfigError, match="'n_atoms' has one value in each shot, and none for a site"):
+        site_map(lifetime, "n_atoms")
