@@ -74,7 +74,9 @@ class Summary:
         scan: What the run measures at each point of the scan, with its fits.
         results: Name and value of what the sequence asks the fits for.
         best: The best point of an adaptive scan.
-        wall_time_s: Time until the end of the last shot; of a resumed run, of all its parts together.
+        simulated_time_s: Time that the shots took in a simulated run.
+        wall_time_s: Time on the computer's clock until the end of the last shot; of a resumed run, of all
+            its parts together.
         watchdog: What the watchdog did.
         resumed: Where it was resumed, and how it had ended before.
         n_damaged_lines: Lines of the index that cannot be read.
@@ -98,6 +100,7 @@ class Summary:
     scan: ScanReport | None = None
     results: Sequence[tuple[str, str]] = ()
     best: BestPoint | None = None
+    simulated_time_s: float = math.nan
     wall_time_s: float = math.nan
     watchdog: Sequence[str] = ()
     resumed: Sequence[str] = ()
@@ -126,6 +129,7 @@ class Summary:
             scan=scan,
             results=results_of(run, scan) if scan else (),
             best=best_point(run),
+            simulated_time_s=sum(shot.row.duration_s for shot in run.shots) if run.simulated else math.nan,
             wall_time_s=_wall_time_s(run),
             watchdog=watchdog_lines(run.path),
             resumed=_resumed(run),
@@ -167,8 +171,8 @@ class Summary:
             *(statistics_rows(self.statistics) if self.has_target else _atom_rows(self.n_atoms)),
             *_measured_rows(self.measured),
             *((clean(name), value) for name, value in self.results),
-            ("wall time", _wall_time(self.wall_time_s)),
-            *(("watchdog", clean(line)) for line in self.watchdog),
+            *_time_rows(self.simulated_time_s, self.wall_time_s),
+            *(("watchdog", one_line(line)) for line in self.watchdog),
             *(("resumed", line) for line in self.resumed),
             *([("warning", damaged)] if self.n_damaged_lines else []),
         ]
@@ -260,9 +264,10 @@ def statistics_rows(results: Statistics | None) -> Facts:
         causes = [f"{cause.replace('_', ' ')} {loss}" for cause, loss in results.losses.items() if loss.value]
         rows.append(("lost in a shot", ", ".join(causes) or "no atoms"))
     if not math.isnan(results.defects_true.value):
-        rows.append(
-            ("true defects", f"{results.defects_true} in a shot, {results.defects_seen} on its last image")
-        )
+        rows += [
+            ("true defects", f"{results.defects_true} at the end of a shot, as the simulation knows"),
+            ("seen defects", f"{results.defects_seen} on the last image of a shot"),
+        ]
     return rows
 
 
@@ -308,8 +313,13 @@ def _numbers(shots: Sequence[int]) -> str:
     return ", ".join(str(shot) for shot in shots[:MAX_LISTED]) + (", ..." * (len(shots) > MAX_LISTED))
 
 
-def _wall_time(time_s: float) -> str:
-    return "-" if math.isnan(time_s) else f"{format_quantity(time_s, 'time')} on the computer's clock"
+def _time_rows(simulated_s: float, wall_s: float) -> Facts:
+    """How long it took; beside the time of the shots of a simulated run, that of the computer is named."""
+    wall_time = "-" if math.isnan(wall_s) else format_quantity(wall_s, "time")
+    if math.isnan(simulated_s):
+        return [("wall time", wall_time)]
+    simulated = f"{format_quantity(simulated_s, 'time')} in all shots together"
+    return [("simulated time", simulated), ("computer time", wall_time)]
 
 
 def _wall_time_s(run: Run) -> float:

@@ -82,6 +82,7 @@ class CameraDriver(Camera):
         self._orientation = orientation
         self._name = context.name or "camera"
         self._clock = context.clock
+        self._trigger_lines = [f"'{line.name}'" for line in context.lines if line.triggers == "camera"]
         self._is_open = False
         self._forget()
 
@@ -278,11 +279,14 @@ class CameraDriver(Camera):
         elif series.trigger == "software" and n_read >= len(self._fired_s):
             reason = "the next one was not triggered"
         elif series.trigger == "external_start" and n_read:
-            reason = f"frame {n_read} is not ready"
+            reason = f"frame {n_read} of the series that its external trigger started is not ready"
         elif series.trigger in get_args(LineTrigger):
-            reason = f"frame {n_read} waits for its external trigger; check the line"
+            line = f", the line {' or '.join(self._trigger_lines)}" if self._trigger_lines else ""
+            reason = f"frame {n_read} waits for its external trigger{line}; check the cable"
+        elif series.trigger == "software":
+            reason = f"frame {n_read} is not ready, although its software trigger was sent"
         else:
-            reason = f"frame {n_read} is not ready"
+            reason = f"frame {n_read} is not ready, which needs no trigger"
         text = f"no frame within {format_quantity(timeout_s, 'time')}: {reason}"
         return DeviceTimeoutError(self._name, text, timeout_s)
 

@@ -159,14 +159,15 @@ def test_for_people(perform: Any) -> None:
     session, out, err, _ = perform(as_json=False)
     assert err == ""
     lines = out.splitlines()
-    assert lines[-7:] == [
+    assert lines[-8:] == [
         f"run               {session.run_dir}",
         "status            complete",
         "shots             2 of 2",
         "defect-free       1 of 2 (50.0 %), 21.6 to 78.4 %",
         "seen defect-free  2 of 2 (100.0 %)",
         "filling           99.8(2) %",
-        "wall time         2 s on the computer's clock",
+        "simulated time    3.8 s in all shots together",
+        "computer time     2 s",
     ]
     assert "shot 0  defect-free after 2 cycles  filling 100.0 %  1.9 s" in lines
 
@@ -252,4 +253,4 @@ def test_a_clock_that_is_set_changes_no_duration(perform: Any) -> None:
     lines = [{"t_utc": f"{day}T10:00:00+00:00", "t_s": t, **ENDED} for t, day in times_s]
     text = "".join(f"{json.dumps(line)}\n" for line in lines)
     (session.run_dir / "events.jsonl").write_text(text, encoding="utf-8")
-    assert "wall time         75 s on the computer's clock" in Summary.of(open_run(session.run_dir)).as_text()
+    assert "computer time     75 s" in Summary.of(open_run(session.run_dir)).as_text()

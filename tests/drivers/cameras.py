@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from labseq.plugin import CameraFacts, Context, Frame
+from labseq.plugin import CameraFacts, Context, Frame, LineSpec
 from labseq.plugin.camera import CameraDriver, ExposureResult, Series
 from labseq.testing.fakes import FakeClock
 
@@ -94,7 +94,9 @@ class Bench:
     def __init__(self, lose: Mapping[int, str] | None = None, **facts: Any) -> None:
         self.clock = FakeClock()
         known: dict[str, Any] = {"readout_s": 5e-3, "max_exposure_s": 10.0, "frame_shape": SHAPE} | facts
-        self.camera = TinyCamera(Context("cam", clock=self.clock), CameraFacts(**known), lose)
+        lines = (LineSpec("exposure", 0, on=("image",), triggers="camera"),)
+        context = Context("cam", clock=self.clock, lines=lines)
+        self.camera = TinyCamera(context, CameraFacts(**known), lose)
         self.camera.open()
         self.camera.log.clear()
 

@@ -144,11 +144,11 @@ def test_a_software_trigger_belongs_to_a_series_with_one() -> None:
 @pytest.mark.parametrize(
     ("trigger", "n_triggered", "n_read", "reason"),
     [
-        ("software", 1, 0, "frame 0 is not ready"),
+        ("software", 1, 0, "frame 0 is not ready, although its software trigger was sent"),
         ("software", 1, 1, "the next one was not triggered"),
         ("software", 3, 3, "all 3 frames of the series were read"),
-        ("internal", 0, 1, "frame 1 is not ready"),
-        ("external", 0, 0, "frame 0 waits for its external trigger; check the line"),
+        ("internal", 0, 1, "frame 1 is not ready, which needs no trigger"),
+        ("external", 0, 0, "frame 0 waits for its external trigger, the line 'exposure'; check the cable"),
     ],
 )
 def test_a_timeout_says_why_and_takes_its_time(
