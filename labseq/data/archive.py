@@ -8,11 +8,13 @@ The tree::
       shots/shot_000000      the content of /entry in the shot's file; also for failed attempts
 
 Settings, devices and target are the same in all shots. The file holds them once, and the shots have hard
-links to them.
+links to them. Axes have dimension scales, from which xarray and netCDF take their names; the shots' own files
+have none, as they would double the time that writing a shot takes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,6 +35,7 @@ from labseq.recording.hdf5 import (
     copy_attributes,
     link_name,
     load_filter,
+    read_attribute,
     read_attributes,
     set_attributes,
     text_array,
@@ -41,6 +44,9 @@ from labseq.recording.shot_file import content_of, open_finished, opened
 
 FORMAT: Final = "labseq-archive"
 FORMAT_VERSION: Final = "4.0"
+
+_ROWS: Final = {table.path.rpartition("/")[2]: table.row for table in schema.TABLES}
+"""Name of a table -> what a row describes, which is the name of its axis."""
 
 
 def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
@@ -81,6 +87,7 @@ def _write_table(group: h5py.Group, run: Run) -> None:
         values = text_array(column.values.tolist()) if column.values.dtype.kind == "O" else column.values
         dataset = group.create_dataset(names[-1], data=values)
         set_attributes(dataset, {"units": column.units, "description": column.description})
+        _attach(dataset, ["shot"])
 
 
 def _write_files(group: h5py.Group, run_dir: Path) -> list[str]:
@@ -139,6 +146,7 @@ class _Shots:
                     self._share(entry[name], copy, name)
                 elif self._frames or name != "images_view":
                     _copy(entry, copy, name, frames=self._frames)
+                    _name_axes(copy[name])
             if "images_view" not in copy:
                 del copy.attrs["default"]
                 set_attributes(copy, {"default": "detection"})
@@ -151,9 +159,38 @@ class _Shots:
         content |= {f"@{key}": repr(value) for key, value in read_attributes(source).items()}
         if self._shared.get(name, (None,))[0] != content:
             source.file.copy(source, copy, name)
+            _name_axes(copy[name])
             self._shared[name] = content, copy[name]
         else:
             copy[name] = self._shared[name][1]
+
+
+def _name_axes(node: Any) -> None:
+    """Give every array and table in a group scales with the names of their axes; or a single one."""
+    if isinstance(node, h5py.Dataset):
+        axes = str(read_attribute(node, "dimensions", ""))
+        if node.dtype.names:
+            table = str(node.name).rpartition("/")[2]
+            axes = _ROWS.get(table, f"{table}_row").replace(" ", "_")
+        if axes:
+            _attach(node, axes.split(", "))
+        return
+    for name in list(node):
+        if not isinstance(node.get(name, getlink=True), h5py.SoftLink):
+            _name_axes(node[name])
+
+
+def _attach(dataset: Any, axes: Sequence[str]) -> None:
+    """Attach the scale of each axis, which is made beside the first array that has it."""
+    for axis, (name, length) in enumerate(zip(axes, dataset.shape, strict=True)):
+        if name not in dataset.parent:
+            indices = dataset.parent.create_dataset(name, data=np.arange(length))
+            set_attributes(indices, {"units": "", "description": f"index along the axis {name}"})
+        scale = dataset.parent[name]
+        if not scale.is_scale:
+            scale.make_scale(name)
+        if scale != dataset:
+            dataset.dims[axis].attach_scale(scale)
 
 
 def _copy(source: Any, copy: Any, name: str, *, frames: bool) -> None:
