@@ -21,6 +21,8 @@ N_STEPS: Final = 600
 FURTHEST: Final = 3.0
 """Largest distance of an atom from the focus in Rayleigh lengths, where the intensity is a tenth. Without an
 end, there would be infinitely many atoms that are barely bound."""
+ETA_STEP: Final = 0.05
+"""Step of the logarithm of a trap's depth in units of kT; recapture is linear within 0.001 between two."""
 MAX_PERIODS: Final = 300.0
 """Largest number of periods within the points for which an oscillation is searched."""
 
@@ -358,7 +360,7 @@ def _draws() -> Floats:
     return np.random.default_rng(0).random((6, 20_000))
 
 
-@lru_cache(maxsize=2)  # a fit comes back to the temperature after a step of another parameter
+@lru_cache(maxsize=16)  # 1 MB each; a fit, and the next fit of a run in progress, need a few of them
 def _bound_atoms(eta: float) -> tuple[Floats, Floats]:
     """Atoms of the Boltzmann distribution in a Gaussian beam, restricted to bound ones.
 
@@ -420,12 +422,24 @@ def _release_recapture(
         wavelength: Its wavelength in m.
         mass: Mass of an atom in atomic mass units.
     """
-    eta = depth / temperature
+    # drawing atoms takes far longer than letting them fly: it is done at fixed depths in units of kT
+    place = math.log(min(max(depth / temperature, 0.05), 1e6)) / ETA_STEP
+    lower, share = math.floor(place), place % 1
+    trap = (depth, waist, wavelength, mass)
+    below, above = (_recaptured(tuple(x), math.exp(ETA_STEP * step), *trap) for step in (lower, lower + 1))
+    return amplitude * ((1 - share) * below + share * above)
+
+
+@lru_cache(maxsize=32)  # most steps of a fit are between the same two depths
+def _recaptured(
+    x: tuple[float, ...], eta: float, depth: float, waist: float, wavelength: float, mass: float
+) -> Floats:
+    """The same at a depth in units of kT, without the amplitude."""
     rayleigh = math.pi * waist**2 / wavelength
     places, velocities = _bound_atoms(eta)
     kinetic = (velocities**2).sum(axis=0) / 2  # in kT
     # Boltzmann constant in J/K (CODATA 2018)
-    flight = velocities * math.sqrt(1.380649e-23 * temperature / (mass * ATOMIC_MASS_KG))
+    flight = velocities * math.sqrt(1.380649e-23 * depth / eta / (mass * ATOMIC_MASS_KG))
     flight /= np.array([waist, waist, rayleigh])[:, None]
 
     def recaptured(t: float) -> float:
@@ -433,7 +447,7 @@ def _release_recapture(
         width = 1 + at[2] ** 2
         return float((kinetic < eta / width * np.exp(-2 * (at[0] ** 2 + at[1] ** 2) / width)).mean())
 
-    return amplitude * np.array([recaptured(t) for t in x])
+    return np.array([recaptured(t) for t in x])
 
 
 def _guess_release(x: Floats, y: Floats) -> dict[str, float]:
@@ -528,7 +542,7 @@ MODELS: Final[Mapping[str, FitModel]] = {
         _release_recapture,
         _guess_release,
         {"depth": math.nan, "waist": math.nan, "wavelength": math.nan, "mass": RB87_U},
-        {"temperature": 1e-9, "amplitude": 0.0},
+        {"temperature": 1e-9, "amplitude": 0.0, "depth": 1e-9, "waist": 1e-9},
         0.02,  # its atoms are counted: smaller steps would see their number jump
     ),
 }

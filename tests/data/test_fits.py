@@ -41,7 +41,6 @@ def fitted(
     model: str, n: int = 25, given: dict[str, str] | None = None, settings: object = TRAP, error: float = 0.01
 ) -> Fit:
     """A fit to points of the model with normal errors."""
-    n = 12 if model == "release_recapture" else n  # it is slow
     x = np.linspace(2e-6, 60e-6, n) if model == "release_recapture" else np.linspace(0.0, 0.1, n)
     rest = (
         {"depth": 300e-6, "waist": 0.98e-6, "wavelength": 808e-9, "mass": 87.0}
