@@ -147,7 +147,9 @@ class _Shots:
                 elif self._frames or name != "images_view":
                     _copy(entry, copy, name, frames=self._frames)
                     _name_axes(copy[name])
-            if "images_view" not in copy:
+            if "images_view" in copy:
+                _link_scales(copy["images_view"])
+            else:
                 del copy.attrs["default"]
                 set_attributes(copy, {"default": "detection"})
 
@@ -178,6 +180,14 @@ def _name_axes(node: Any) -> None:
     for name in list(node):
         if not isinstance(node.get(name, getlink=True), h5py.SoftLink):
             _name_axes(node[name])
+
+
+def _link_scales(view: Any) -> None:
+    """Put the scales of what a view of the frames links to beside the links, where netCDF looks for them."""
+    folder = view.get("frames", getlink=True).path.rpartition("/")[0]
+    for name, node in view.file[folder].items():
+        if node.is_scale and name not in view:
+            view[name] = h5py.SoftLink(f"{folder}/{name}")
 
 
 def _attach(dataset: Any, axes: Sequence[str]) -> None:

@@ -105,6 +105,7 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
     ]
     names = {*DESCRIPTIONS}
     scanned = (run.record.get("scan") or {}).get("addresses") or ()
+    known_units = {"": run.units, "reading.": run.reading_units}
     for prefix, values_of in _GROUPS.items():
         groups = [values_of(row) for row in rows]
         for name in dict.fromkeys(name for group in groups for name in group):
@@ -113,7 +114,7 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
             while full_name in names:
                 full_name += "_"
             names.add(full_name)
-            units = unit_of(name) if prefix else run.units.get(name, "")
+            units = known_units.get(prefix, {}).get(name, unit_of(name) if prefix else "")
             description = _description(prefix, name, scanned=name in scanned)
             columns.append(make_column(full_name, [group.get(name) for group in groups], units, description))
     for name, values in results.items():

@@ -133,6 +133,18 @@ class Run:
         return dict(self.record.get("units") or {})
 
     @property
+    def reading_units(self) -> Mapping[str, str]:
+        """Units of the readings whose devices name them: "laser.power" -> "W"."""
+        devices: Mapping[str, Any] = self.record.get("devices") or {}
+        units = {name: about.get("units") for name, about in devices.items() if isinstance(about, dict)}
+        return {
+            f"{name}.{value}": str(unit)
+            for name, of_device in units.items()
+            if isinstance(of_device, dict)
+            for value, unit in of_device.items()
+        }
+
+    @property
     def changes(self) -> Mapping[str, str]:
         """Settings changed by ``--set`` and other options: address -> value, as it was typed."""
         overrides = dict(self.record.get("overrides") or {})

@@ -82,7 +82,10 @@ class Hardware(ABC):
 
     @abstractmethod
     def describe(self) -> Mapping[str, Any]:
-        """Model, serial number, firmware, current settings: JSON-ready values."""
+        """Model, serial number, firmware, current settings: JSON-ready values.
+
+        Under "units", exports find the unit of each value that :meth:`poll` gives: name -> unit, in SI.
+        """
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
         """Versions of packages, libraries and firmware of the open device, for ``labseq devices``.

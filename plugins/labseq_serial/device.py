@@ -315,6 +315,7 @@ class SerialDevice(Device):
             "baud_rate": settings.baud_rate,
             "commands": list(settings.commands),
             "values": list(settings.values),
+            "units": {name: value.quantity.si_name for name, value in settings.values.items() if value.unit},
         }
 
     def _ready(self, *, on_open: bool = True) -> Instrument:

@@ -56,6 +56,16 @@ class Unit:
         """Whether the number on the line is the one that the user gives."""
         return not self.dimension or UNITS[self.dimension].get(self.name) == 1.0
 
+    @property
+    def si_name(self) -> str:
+        """The unit of the number that the user gives.
+
+        Example:
+            >>> Unit.of("degC").si_name, Unit.of("MHz").si_name, Unit.of("mA").si_name
+            ('K', 'Hz', 'mA')
+        """
+        return next(iter(UNITS[self.dimension])) if self.dimension else self.name
+
     def read(self, given: object) -> float:
         """A number as the user gives it: SI, or text with a unit.
 

@@ -69,6 +69,13 @@ def test_csv_has_nothing_where_nothing_is_known(tmp_path: Path) -> None:
     assert row["reading.a,b"] == 'say "µ"'
 
 
+def test_readings_have_the_units_that_their_devices_name(tmp_path: Path) -> None:
+    devices = {"laser": {"units": {"power": "W", "mode": 3}}, "odd": {"units": "W"}, "older": None}
+    shot = make_shot(readings={"laser.power": 0.1, "laser.current_a": 1.0, "odd.x": 2.0})
+    units = write(tmp_path, shot, devices=devices).to_dataframe().attrs["units"]
+    assert [units[f"reading.{name}"] for name in ("laser.power", "laser.current_a", "odd.x")] == ["W", "A", ""]
+
+
 @pytest.mark.needs("pyarrow")
 def test_parquet_reads_back_with_its_units(run: Run, tmp_path: Path) -> None:
     from pyarrow import parquet
@@ -136,6 +143,7 @@ def test_xarray_takes_the_names_of_the_axes_from_an_archive(run: Run, tmp_path: 
     assert found["t_s"] == image
     assert {*sizes("shots/shot_000001/target")["fill"]} == {"row", "col"}
     assert {*sizes("shots/shot_000000/camera/camera")["frames"]} == {"frame", "y", "x"}
+    assert {*sizes("shots/shot_000000/images_view")["frames"]} == {"frame", "y", "x"}
     assert {*sizes("shots/shot_000000/rearrangement")["predicted"]} == {"cycle", "row", "col"}
     assert sizes("table")["filling_fraction"] == {"shot": len(run.shots)}
 
