@@ -22,7 +22,7 @@ from functools import partial
 from typing import Any, Final, ParamSpec, TypeVar
 
 from labseq.errors import DeviceError, DeviceHungError, LabseqError, PlanError, StopRequested
-from labseq.messages import format_error
+from labseq.messages import format_plugin_error
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -475,7 +475,7 @@ class Guard:
             return call.result
         if isinstance(call.error, LabseqError) or call.has_steps:
             raise call.error
-        owner, text = limit.owner, f"{limit.name}raised {format_error(call.error)}"
+        owner, text = limit.owner, f"{limit.name}raised {format_plugin_error(call.error)}"
         raise (PlanError(text) if owner == "planner" else DeviceError(owner, text)) from call.error
 
     def _directly(self, shot: GuardedCall, limit: Limit, work: partial[Any]) -> GuardedCall:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import sys
+import traceback
 from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
-from itertools import islice
+from itertools import accumulate, islice
 from typing import Any, Final
 
 _MAX_LENGTH: Final = 60
@@ -70,6 +72,21 @@ def format_error(error: BaseException) -> str:
     if isinstance(error, BaseExceptionGroup):
         return one_line(f"{text}; the first: {format_error(error.exceptions[0])}")
     return text
+
+
+def format_plugin_error(error: BaseException) -> str:
+    """The same of an error in a plugin's code, with its file and line: "KeyError: 'typo' (mine.py:7)"."""
+    return format_error(error) + _plugin_line(error)
+
+
+def _plugin_line(error: BaseException) -> str:
+    """The last line of a plugin's code that an error came through, as " (FILE:LINE)"; "" if none."""
+    for frame, line in reversed([*traceback.walk_tb(error.__traceback__)]):
+        names = accumulate(str(frame.f_globals.get("__name__", "")).split("."), "{}.{}".format)
+        # what every plugin's module states, and nothing else does
+        if any(hasattr(sys.modules.get(name), "LABSEQ_API") for name in names):
+            return f" ({visible(frame.f_code.co_filename)}:{line})"
+    return ""
 
 
 def one_line(text: str) -> str:

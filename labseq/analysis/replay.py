@@ -24,7 +24,7 @@ from labseq.config.addresses import Override, split_overrides
 from labseq.data import Run, Shot
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, collecting
 from labseq.guard import Guard
-from labseq.messages import clean, format_error
+from labseq.messages import clean, format_plugin_error
 from labseq.model import (
     CycleRecord,
     MotionSpec,
@@ -112,7 +112,7 @@ class ReplayedImages:
                 replayed = np.asarray(occupancy, np.bool_).reshape(image.occupancy.shape)
                 replayed_confidence = float(np.mean(confidence))
             except (Exception, SystemExit) as error:  # noqa: BLE001 - a plugin may raise anything
-                self.failures[shot.index, i] = format_error(error)
+                self.failures[shot.index, i] = format_plugin_error(error)
                 continue
             appeared, vanished = replayed & ~image.occupancy, image.occupancy & ~replayed
             self.appeared += appeared

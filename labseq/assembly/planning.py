@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -28,10 +27,9 @@ from labseq.config.profile import load_profile
 from labseq.config.sequence import DEFAULT_PLANNER, load_sequence
 from labseq.errors import ConfigError, InvalidPlanError, LabseqError, LimitError, PlanError, Problem
 from labseq.guard import Guard
-from labseq.messages import clean, format_error, visible
+from labseq.messages import clean, format_plugin_error, visible
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import Survival, check_plan, predict_survival
-from labseq.plugins.calls import error_location
 from labseq.plugins.host import PluginHost
 from labseq.roles import Planner
 from labseq.settings import Choice, PatternChoice
@@ -361,8 +359,4 @@ def call_planner(
     if isinstance(error, LabseqError):
         is_named = not isinstance(error, PlanError) or error.planner
         raise error if is_named else PlanError(str(error), name) from error
-    home = getattr(sys.modules.get(type(planner).__module__), "__file__", None)
-    place = error_location(error, Path(home) if home else None)
-    raise PlanError(
-        f"plan() raised {format_error(error)}" + (f" ({place})" if place else ""), name
-    ) from error
+    raise PlanError(f"plan() raised {format_plugin_error(error)}", name) from error

@@ -12,7 +12,7 @@ from labseq.assembly.quantities import check_quantity
 from labseq.config.scan import AdaptiveScan
 from labseq.errors import ConfigError, DeviceError, ProblemCollector
 from labseq.guard import Guard, StopFlag
-from labseq.messages import clean
+from labseq.messages import clean, format_plugin_error
 from labseq.model import ScanRange, ScanSpace, TargetPattern, VisitedPoint
 from labseq.recording.run_file import SCANNER
 from labseq.units import written
@@ -113,8 +113,7 @@ class Search:
                 answer: Any = scanner.next_point(tuple(visited))
                 values = dict(cast("Mapping[Any, Any]", answer)) if isinstance(answer, Mapping) else None
             except Exception as error:
-                text = f"next_point() raised {type(error).__name__}"
-                raise self._error(f"{text}: {error}" if str(error) else text) from error
+                raise self._error(f"next_point() raised {format_plugin_error(error)}") from error
             if answer is None:
                 return None
             expected = [range_.address for range_ in self.ranges]

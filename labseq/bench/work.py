@@ -20,7 +20,7 @@ from labseq.config.addresses import Override
 from labseq.config.document import Document
 from labseq.errors import ConfigError, PlanError, Problem, ProblemCollector
 from labseq.kernels.kernel import load_kernels
-from labseq.messages import format_error
+from labseq.messages import format_plugin_error
 from labseq.model import MotionSpec, Occupancy, SiteGrid, TargetPattern
 from labseq.motion import check_plan, predict_survival
 from labseq.plugins.host import PluginHost
@@ -74,7 +74,7 @@ def warm(prepared: list[PreparedCondition]) -> None:
             try:
                 runner.planner.warm()
             except Exception as error:
-                raise PlanError(f"warm() raised {format_error(error)}", runner.name) from error
+                raise PlanError(f"warm() raised {format_plugin_error(error)}", runner.name) from error
     load_kernels()
 
 
@@ -274,7 +274,9 @@ def work(prepared: list[PreparedCondition], seed: int, job: Job) -> JobResults:
             except Exception as error:  # noqa: BLE001 - a planner may raise anything; it is counted
                 if not any(failure.planner_entry == i for failure in failures):
                     message = (
-                        str(error) if isinstance(error, PlanError) else f"plan() raised {format_error(error)}"
+                        str(error)
+                        if isinstance(error, PlanError)
+                        else f"plan() raised {format_plugin_error(error)}"
                     )
                     failures.append(Failure(i, job.condition, index, message))
                 rows.append((0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, *_NO_SCANS, 0.0, 0, 0, True))

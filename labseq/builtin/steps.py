@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from labseq.messages import format_error
+from labseq.messages import format_plugin_error
 from labseq.plugin import (
     COMPUTER,
     ConfigError,
@@ -211,7 +211,7 @@ class DeviceStep(Step):
             except LabseqError as error:
                 return {"do": str(error)}
             except Exception as error:  # noqa: BLE001 - of the driver, for example an unknown argument
-                fault = f"check_command() raised {format_error(error)}"
+                fault = f"check_command() raised {format_plugin_error(error)}"
                 return {"do": f"{self.settings.name}: {fault}"}
         return {}
 

@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from labseq.config.yaml_nodes import Mark, Node, comma_hint, resolve
 from labseq.errors import ConfigError, Loc, Problem
-from labseq.messages import clean, closest, did_you_mean, format_error, listing, shown
+from labseq.messages import clean, closest, did_you_mean, format_plugin_error, listing, shown
 from labseq.settings import (
     FOLDER,
     NEEDS_UNITS,
@@ -117,7 +117,7 @@ def check(model: type[M], node: Node, context: ValidationContext) -> M | list[Fi
     except ValidationError as error:
         return _findings(error, model, node, context)
     except Exception as error:  # noqa: BLE001 - a plugin's own validator may raise anything
-        reason = format_error(error)
+        reason = format_plugin_error(error)
         return [Finding((), Problem(f"these settings make the plugin's check fail: {reason}"))]
 
 

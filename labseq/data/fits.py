@@ -248,7 +248,8 @@ def _check_number(model: Model, points: Points, fixed: Mapping[str, float]) -> N
         raise _problem("all parameters are fixed", "at least one to fit")
     n_values = len(np.unique(points.x))
     if n_values <= len(free):
-        problem = f"{n_values} points are too few for a fit of {len(free)} parameters ({', '.join(free)})"
+        come = "1 point is" if n_values == 1 else f"{n_values} points are"
+        problem = f"{come} too few for a fit of {len(free)} parameters ({', '.join(free)})"
         raise _problem(problem, f"at least {len(free) + 1} different values with a result")
 
 

@@ -152,7 +152,7 @@ def quantity_problem(
         return f"there is no quantity '{clean(name)}'", f"one of {names}", hint
     if named and len(named) != OF_IMAGES[kind].n_images:
         expected = "two images: survival:IMAGE,IMAGE" if kind == "survival" else f"one image: {kind}:IMAGE"
-        return f"'{clean(name)}' names {len(named)}", expected, ""
+        return f"'{clean(name)}' names {len(named)} image{'s' * (len(named) != 1)}", expected, ""
     for image in named:
         is_known = image in images or image.isdecimal() or any(image.startswith(f"{i}_") for i in images)
         if images and not is_known:

@@ -13,7 +13,7 @@ from typing import Any, Final, cast
 
 from labseq.errors import RecordingError
 from labseq.files import LineLog, NewLines, explained
-from labseq.messages import format_error
+from labseq.messages import format_plugin_error
 from labseq.recording import folders
 
 SHOT: Final = "shot"
@@ -70,7 +70,7 @@ class ResultsLog:
 
     def fail(self, shot: int, error: BaseException) -> None:
         """Write why a shot has no result."""
-        self._log.append({SHOT: shot, ERROR: format_error(error)}, sync=True)
+        self._log.append({SHOT: shot, ERROR: format_plugin_error(error)}, sync=True)
 
 
 class Results:

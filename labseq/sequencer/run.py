@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
-import traceback
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
@@ -15,7 +13,7 @@ from typing import Any, Final, Protocol
 
 from labseq.errors import LabseqError, StopRequested
 from labseq.guard import DRIVER_MARGIN_S, Guard, StopFlag
-from labseq.messages import error_text, format_error
+from labseq.messages import error_text, format_error, format_plugin_error
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.policies import RunPolicy, StepPolicy, Then, may_be_retried
 from labseq.model.records import ShotStatus, unique_names
@@ -153,7 +151,7 @@ def plan_timeline(lab: Lab, guard: Guard, number: int, name: str, step: Step) ->
     """The timeline of one step, see :func:`plan_timelines`; ``number`` is its index in the shot."""
 
     def entries() -> list[TimelineEntry]:
-        with _named(number, name, step):
+        with _named(number, name):
             found = list(step.plan_timeline(lab.step_context))
             if other := [one for one in found if not isinstance(one, TimelineEntry)]:  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(f"plan_timeline() gave {other[0]!r}; expected TimelineEntry objects")
@@ -163,23 +161,15 @@ def plan_timeline(lab: Lab, guard: Guard, number: int, name: str, step: Step) ->
 
 
 @contextmanager
-def _named(number: int, name: str, step: Step) -> Generator[None]:
+def _named(number: int, name: str) -> Generator[None]:
     """Add the name of the step, and the line of its code, to errors that are not labseq's own."""
     try:
         yield
     except LabseqError:
         raise
     except BaseException as error:
-        text = f"step {number} ({name}) raised {format_error(error)}{_line(error, step)}"
+        text = f"step {number} ({name}) raised {format_plugin_error(error)}"
         raise LabseqError(text) from error
-
-
-def _line(error: BaseException, step: Step) -> str:
-    """The last line of the step's own file that an error came through, as " (FILE:LINE)"; "" if none."""
-    file = getattr(sys.modules.get(type(step).__module__), "__file__", None)
-    frames = traceback.walk_tb(error.__traceback__)
-    lines = [line for frame, line in frames if frame.f_code.co_filename == file]
-    return f" ({file}:{lines[-1]})" if lines else ""
 
 
 class ShotSink(Protocol):
@@ -422,7 +412,7 @@ class Sequencer:
             shot.stages.begin_attempt()
             try:
                 longest_s = policy.limit_s + self.lab.timeouts.call_s
-                with self.guard.step(f"step {number} ({name}) ", longest_s), _named(number, name, step):
+                with self.guard.step(f"step {number} ({name}) ", longest_s), _named(number, name):
                     step.run(shot)
                 shot.stages.check_timeout()
             except LabseqError as error:

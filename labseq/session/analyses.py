@@ -27,7 +27,7 @@ from labseq.config.validation import validate_values
 from labseq.data import Run, open_run
 from labseq.data.follower import Follower
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
-from labseq.messages import format_error
+from labseq.messages import format_plugin_error
 from labseq.plain import now_utc
 from labseq.processes import Lock, knows_no_locks
 from labseq.recording.results import AGAIN, ResultsLog, read_results, results_file, shots_with_result
@@ -171,7 +171,7 @@ def analyse_missing(run: Run, settings: Mapping[str, Any], *, again: bool = Fals
     failures: dict[int, str] = {}
 
     def failed(shot: int, error: BaseException) -> None:
-        failures[shot] = format_error(error)
+        failures[shot] = format_plugin_error(error)
 
     with results_of(run.path, prepared, again=again) as (log, before):
         n_done = analyse(prepared, (s for s in run.shots if s.index not in before), log, failed)
@@ -272,7 +272,7 @@ def _as_they_come(run_dir: Path, before: set[int], end: _End) -> Generator[Recor
 
 def _report(shot: int, error: BaseException) -> None:
     traceback.print_exception(error)
-    print(f"{FAILED}shot {shot}: {format_error(error)}", file=sys.stderr, flush=True)  # noqa: T201 - its log
+    print(f"{FAILED}shot {shot}: {format_plugin_error(error)}", file=sys.stderr, flush=True)  # noqa: T201 - its log
 
 
 if __name__ == "__main__":

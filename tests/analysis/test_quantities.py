@@ -73,7 +73,7 @@ def test_every_recorded_or_analysed_number_is_a_quantity(lifetime: labseq.Run) -
             "survival:befor,after",
             "no image 'befor' for 'survival:befor,after'; expected one of before, after; did",
         ),
-        ("survival:before", "names 1; expected two images"),
+        ("survival:before", "names 1 image; expected two images"),
         ("filing_fraction", "did you mean 'filling_fraction'?"),
     ],
 )

@@ -116,7 +116,165 @@ def test_code_that_fails_is_named(where: str, error: str, says: str) -> None:
     assert ("SystemExit: 0" if error == EXIT else "KeyError: 'typo'") in str(caught.value)
     assert says in str(caught.value)
     line = 1 + PLUGIN[: PLUGIN.index(f"pass  # {where}")].count("\n")
-    assert f"mine.py:{line})" in str(caught.value) or where in ("timeline", "validator")
+    assert f"mine.py:{line})" in str(caught.value)
+
+
+IN_A_RUN = """
+import labseq
+from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
+from labseq_virtual import camera, devices, simulation, tweezers
+from labseq_virtual.settings import (
+    CameraSettings, DeviceSettings, LinesSettings, MobileTweezersSettings, SimulationSettings,
+    StaticTweezersSettings,
+)
+
+LABSEQ_API = 1
+
+
+def typo(*_, **__):
+    raise KeyError("typo")
+
+
+class Camera(camera.VirtualCamera):
+    def read(self, timeout_s):
+        typo(timeout_s)
+
+
+class Static(tweezers.VirtualStaticTweezers):
+    def start(self):
+        typo()
+
+
+class Mobile(tweezers.VirtualMobileTweezers):
+    def play(self):
+        typo()
+
+
+class Lines(devices.VirtualLines):
+    def fire(self):
+        typo()
+
+
+class Gauge(devices.VirtualDevice):
+    def command(self, name, **arguments):
+        typo()
+
+
+class Atoms(simulation.VirtualSimulation):
+    def load(self, t_start_s, duration_s):
+        typo()
+
+
+class Detector(ThresholdDetector):
+    def signals(self, frame):
+        typo()
+
+
+class Planner:
+    def __init__(self, settings, context):
+        pass
+
+    def plan(self, occupancy, target):
+        typo()
+
+
+class Scanner:
+    def __init__(self, settings, space):
+        pass
+
+    def next_point(self, visited):
+        typo()
+
+
+class Look:
+    def __init__(self, settings, context):
+        pass
+
+    def shot(self, shot):
+        typo()
+
+
+class Step(labseq.plugin.Step):
+    def __init__(self, settings):
+        pass
+
+    def plan_timeline(self, context):
+        return []
+
+    def run(self, shot):
+        typo()
+
+
+class Nothing(labseq.plugin.Settings):
+    pass
+
+
+@labseq.plugin.hookimpl
+def labseq_register(registry):
+    registry.camera("bad", Camera, CameraSettings, virtual_time=True)
+    registry.static_tweezers("bad", Static, StaticTweezersSettings, virtual_time=True)
+    registry.mobile_tweezers("bad", Mobile, MobileTweezersSettings, virtual_time=True)
+    registry.lines("bad", Lines, LinesSettings, virtual_time=True)
+    registry.device("bad", Gauge, DeviceSettings, virtual_time=True)
+    registry.simulation("bad", Atoms, SimulationSettings)
+    registry.detector("bad", Detector, ThresholdSettings)
+    registry.planner("bad", Planner, Nothing)
+    registry.scanner("bad", Scanner, Nothing)
+    registry.analysis("bad", Look, Nothing)
+    registry.step("bad", Step, Nothing)
+
+
+@labseq.plugin.hookimpl
+def labseq_shot_finished(shot):
+    typo()
+"""
+"""One plugin of each kind, which fails in its own code in a shot."""
+WHOLE = """labseq: 1
+name: whole
+profile: ./p.yaml
+target: {pattern: compact, rows: 3, cols: 3}
+plugin_folders: [plugins]
+planner: {use: psca}
+shot:
+  - load: {duration: 500 ms}
+  - image: {exposure: 45 ms}
+  - rearrange: {cycles: 1, window: 60 ms, exposure: 45 ms}
+"""
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "profile.camera.use=bad",
+        "profile.static_tweezers.use=bad",
+        "profile.mobile_tweezers.use=bad",
+        "profile.lines={use: bad, channels: {light: {channel: 3, on: [image]}}}",
+        "shot.0={device: {name: gauge, do: go}}",
+        "profile.simulation.use=bad",
+        "profile.detector.use=bad",
+        "planner={use: bad}",
+        "scan={use: bad, points: 2, maximise: filling, over: {shot.0.load.duration: {from: 1 ms, to: 5 ms}}}",
+        "analysis=[{use: bad, finish_within: 60 s}]",
+        "shot.0={bad: {}}",
+        "name=watched",  # the hook of an observer alone
+    ],
+)
+def test_code_of_each_kind_that_fails_in_a_run_is_named_with_its_line(change: str) -> None:
+    write(IN_A_RUN, PROFILE + "devices: {gauge: {use: bad}}\n")
+    Path("s.yaml").write_text(WHOLE, encoding="utf-8")
+    seen, message, one_shot = RecordingObserver(), "", [] if "scan" in change else ["shots=1"]
+    with labseq.Session.open(
+        "s.yaml", overrides=[change, *one_shot], observer=seen, output=Path("data")
+    ) as session:
+        try:
+            session.run()
+        except LabseqError as error:
+            message = str(error)
+    messages = [message, *(values["text"] for name, values in seen.events if name == "warning")]
+    line = 1 + IN_A_RUN[: IN_A_RUN.index("raise KeyError")].count("\n")
+    if change != "name=watched":
+        messages = [text for text in messages if "observer hook" not in text]
+    assert any(f"KeyError: 'typo' ({Path('plugins/mine.py').absolute()}:{line})" in text for text in messages)
 
 
 def test_a_step_without_the_base_class_of_its_role_is_named() -> None:
