@@ -136,7 +136,8 @@ class ProblemCollector:
 
     def _joined(self) -> ConfigError:
         sources = list(dict.fromkeys(problem.source for problem in self.problems))
-        return ConfigError(sorted(self.problems, key=lambda p: (sources.index(p.source), p.line, p.column)))
+        different = dict.fromkeys(self.problems)  # points of a scan may share one
+        return ConfigError(sorted(different, key=lambda p: (sources.index(p.source), p.line, p.column)))
 
 
 @contextmanager

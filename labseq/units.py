@@ -276,3 +276,16 @@ def format_quantity(value: float, dimension: str, digits: int = 3) -> str:
     if "e" in number and abs(amount) < 1e9:  # larger numbers keep the exponent
         number = f"{amount:.0f}"
     return f"{number} {unit}"
+
+
+def size_text(n_bytes: int) -> str:
+    """Write a size on disk.
+
+    Example:
+        >>> size_text(6_351_456), size_text(900)
+        ('6.4 MB', '0.9 kB')
+    """
+    for unit, factor in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if n_bytes >= factor:
+            return f"{n_bytes / factor:.1f} {unit}"
+    return f"{n_bytes / 1e3:.1f} kB"

@@ -27,7 +27,7 @@ from labseq.config.sequence import SequenceSpec, StepSpec, load_sequence
 from labseq.errors import ConfigError, LabseqError, PluginLoadError, ProblemCollector
 from labseq.model import TargetPattern
 from labseq.model.policies import NO_POLICY, RunPolicy, StepPolicy
-from labseq.recording.results import PREFIX
+from labseq.recording.folders import RESULT_PREFIX
 from labseq.recording.run_file import plain_regions
 from labseq.roles import Context, Step
 from labseq.settings import settings_of
@@ -337,7 +337,7 @@ def make_analyses(
     dumps: list[dict[str, Any]] = []
     results: list[str] = []
     for choice in sequence.analysis:
-        prefix, instance = f"{PREFIX}{choice.use}.", None
+        prefix, instance = f"{RESULT_PREFIX}{choice.use}.", None
         with problems:
             chosen = resolve(hardware.host, document, "analysis", choice)
             context = Context(choice.use, hardware.grid, hardware.motion, calibrations=hardware.calibrations)

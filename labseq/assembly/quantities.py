@@ -14,7 +14,7 @@ from labseq.messages import clean, did_you_mean, listing
 from labseq.model import TargetPattern
 from labseq.model.image_quantities import OF_IMAGES, parse_name
 from labseq.model.records import unique_names
-from labseq.recording.results import PREFIX
+from labseq.recording.folders import RESULT_PREFIX
 from labseq.roles import Step
 
 _JUDGED: Final = frozenset(
@@ -63,8 +63,10 @@ def check_quantity(
 
 def _analysis_hint(name: str, results: Iterable[str]) -> str:
     """How to get the result of an analysis that the sequence does not list; "" for other names."""
-    analysis = name.removeprefix(PREFIX).split(".")[0]
-    if not name.startswith(PREFIX) or any(result.startswith(f"{PREFIX}{analysis}.") for result in results):
+    analysis = name.removeprefix(RESULT_PREFIX).split(".")[0]
+    if not name.startswith(RESULT_PREFIX) or any(
+        result.startswith(f"{RESULT_PREFIX}{analysis}.") for result in results
+    ):
         return ""
     return f"the sequence must list the analysis: 'analysis: [{{use: {clean(analysis)}}}]'"
 

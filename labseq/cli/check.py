@@ -19,16 +19,15 @@ from labseq.console.errors import warning_lines
 from labseq.console.events import LogLines
 from labseq.console.output import say
 from labseq.console.report import Facts, aligned, reporting
-from labseq.console.text import age_text, clock_time, encodes, plural, settings_text, size_text
+from labseq.console.text import age_text, clock_time, encodes, plural, settings_text
 from labseq.errors import Problem
 from labseq.messages import clean
 from labseq.model import CalibrationEntry, TimelineEntry
 from labseq.model.policies import StepPolicy
-from labseq.recording import data_root
 from labseq.session.check import CheckReport, check
 from labseq.session.rehearsal import Rehearsal
 from labseq.session.session import Session
-from labseq.units import format_quantity
+from labseq.units import format_quantity, size_text
 
 BAR_WIDTH: Final = 30
 
@@ -199,7 +198,7 @@ class CheckedSequence:
             n_images=checked.n_images,
             shot_bytes=checked.shot_bytes,
             run_bytes=None if checked.shot_bytes is None else checked.n_shots * checked.shot_bytes,
-            free_bytes=_free_bytes(data_root()),
+            free_bytes=checked.free_bytes,
             first_cycle_s=None if checked.rehearsal is None else FirstCycle.of(checked.rehearsal),
             calibrations=[
                 UsedCalibration(entry.kind, entry.id, entry.taken_utc, age_s(entry))
@@ -246,12 +245,6 @@ class CheckedSequence:
             over = f"over {self.first_cycle_s.n_loadings} random loadings"
             totals.append(("first cycle", f"median {median}, 95th percentile {p95}, {over}"))
         return totals
-
-
-def _free_bytes(folder: Path) -> int:
-    """Free space of the disk on which a folder is, or will be."""
-    path = folder.absolute()
-    return shutil.disk_usage(next(parent for parent in (path, *path.parents) if parent.exists())).free
 
 
 def check_sequence(

@@ -11,7 +11,7 @@ from typing import Any, Final
 from labseq.console.output import say
 from labseq.console.report import Column, aligned, print_report, table
 from labseq.console.runs import folder_of_run
-from labseq.console.text import plural, size_text
+from labseq.console.text import plural
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, visible
 from labseq.recording import data_root
@@ -19,6 +19,7 @@ from labseq.recording.index import read_index
 from labseq.recording.listing import runs_in
 from labseq.recording.notes import Notes, read_notes, write_notes
 from labseq.recording.run_file import read_run, read_state
+from labseq.units import size_text
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,8 +85,13 @@ def report_compiling(about_s: float) -> None:
 
 
 def compiling_text(about_s: float) -> str:
-    """What to say before kernels are compiled."""
-    return f"compiling kernels, about {max(1.0, about_s):.0f} s; later runs find them in the cache"
+    """What to say before kernels are compiled, which this process is going to do."""
+    from labseq.kernels.kernel import cache_problem  # few commands compile
+
+    text = f"compiling kernels, about {max(1.0, about_s):.0f} s"
+    if problem := cache_problem():
+        return f"{text}, at every start: {problem}"
+    return f"{text}; later runs find them in the cache"
 
 
 def as_line(values: Any) -> str:

@@ -81,19 +81,6 @@ def age_text(duration_s: float | None, suffix: str = "") -> str:
     return plural(int(duration_s), "second") + suffix
 
 
-def size_text(n_bytes: int) -> str:
-    """Write a size on disk.
-
-    Example:
-        >>> size_text(6_351_456), size_text(900)
-        ('6.4 MB', '0.9 kB')
-    """
-    for unit, factor in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
-        if n_bytes >= factor:
-            return f"{n_bytes / factor:.1f} {unit}"
-    return f"{n_bytes / 1e3:.1f} kB"
-
-
 def settings_text(settings: Mapping[str, Any]) -> str:
     """Write the settings that have a value on one line.
 

@@ -29,8 +29,9 @@ from labseq.model.image_quantities import (
     measured_in,
     parse_name,
 )
+from labseq.recording.folders import RESULT_PREFIX
 from labseq.recording.index import IndexRow
-from labseq.recording.results import PREFIX, result_columns
+from labseq.recording.results import result_columns
 from labseq.recording.schema import unit_of
 from labseq.units import parse_any
 
@@ -246,7 +247,7 @@ def names_measured(resolved: Mapping[str, Any], target: TargetPattern) -> tuple[
 
 def quantity_of(run: Run, name: str) -> Quantity:
     """A quantity of a run whose name has been checked."""
-    return make_quantity(name, run.target, _numbers(run) if name.startswith(PREFIX) else None)
+    return make_quantity(name, run.target, _numbers(run) if name.startswith(RESULT_PREFIX) else None)
 
 
 def steps_that_load(run: Run) -> frozenset[int]:

@@ -18,6 +18,7 @@ import importlib
 import os
 import shutil
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -110,6 +111,19 @@ def announcing(announce: Callable[[float], None]) -> Generator[None]:
     finally:
         with suppress(ValueError):  # it was called
             _ANNOUNCE.remove(announce)
+
+
+def cache_problem() -> str:
+    """Why what is compiled cannot be kept, with what to do; "" if it can."""
+    folder, remedy = "the user's cache", "set LABSEQ_CACHE to a folder that you may write to"
+    try:
+        folder = str(cache_root())
+        (cache_root() / "kernels").mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=cache_root() / "kernels"):
+            return ""
+    except (OSError, RuntimeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        return f"{folder} cannot be written ({reason.lower()}): {remedy}"
 
 
 def load_kernels(poll: Callable[[], None] = lambda: None) -> None:
@@ -420,6 +434,8 @@ def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> N
     n_workers = min(4, n_cores(), len(seconds))
     if multiprocessing.current_process().daemon:
         return  # it may not start processes: a worker of a campaign or a cluster
+    if cache_problem():
+        return  # what they compile would be lost
     if n_workers < 2 or sum(seconds.values()) < WORTH_A_PROCESS_S:
         return
     while _ANNOUNCE:

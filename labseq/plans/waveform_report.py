@@ -9,11 +9,11 @@ from pathlib import Path
 
 from labseq.console.output import check_different, json_writer, report_compiling, say
 from labseq.console.report import aligned
-from labseq.console.text import percent, plural, size_text
+from labseq.console.text import percent, plural
 from labseq.plans.axis_statistics import AxisStatistics
 from labseq.plans.plan import subject, warnings
 from labseq.plans.waveform import PlannedWaveform, WaveformRequest, plan_waveform
-from labseq.units import format_quantity
+from labseq.units import format_quantity, size_text
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,6 @@ SHOT: Final = "shot"
 ERROR: Final = "error"
 AGAIN: Final = "again"
 _SUFFIX: Final = ".jsonl"
-PREFIX: Final = "analysis."
-"""Prefix of the names of results: "analysis.NAME.KEY"."""
 
 
 def results_file(run_dir: Path, name: str) -> Path:
@@ -148,6 +146,6 @@ def result_columns(run_dir: Path) -> dict[str, dict[int, Any]]:
             for key, value in row.items():
                 if key not in (SHOT, ERROR) and isinstance(value, bool | int | float | str):
                     # the name that the sequence gives; that of the file has no spaces or slashes
-                    name = f"{PREFIX}{about.get('analysis', path.stem)}.{key}"
+                    name = f"{folders.RESULT_PREFIX}{about.get('analysis', path.stem)}.{key}"
                     columns.setdefault(name, {})[row[SHOT]] = value
     return columns

@@ -100,6 +100,13 @@ class Hardware(ABC):
         """What it puts out when nothing plays, in a few words for ``labseq check``; "" for nothing."""
         return ""
 
+    def check_settings(self) -> Mapping[str, Problem]:
+        """Setting -> what is wrong with it that a look at the computer shows, such as a missing file.
+
+        Called by ``labseq check`` and before a run's folder is made, without touching hardware.
+        """
+        return {}
+
     def warm(self) -> None:
         """Import every kernel that a shot needs, before ``open()``; labseq then compiles or loads them."""
 

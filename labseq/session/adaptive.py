@@ -15,7 +15,7 @@ from labseq.data.columns import quantities_in
 from labseq.data.quantities import make_quantity
 from labseq.errors import DeviceError
 from labseq.model import VisitedPoint
-from labseq.recording.results import PREFIX
+from labseq.recording.folders import RESULT_PREFIX
 
 if TYPE_CHECKING:
     from labseq.session.prepared import History, PreparedRun
@@ -41,7 +41,9 @@ class SearchedPoints:
         self._sign = 1.0 if choice.minimise is None else -1.0
         self._current: tuple[int | None, Point | None] = -1, None
         self._visited: list[VisitedPoint] = []
-        self._has_warned = self._quantity.name.startswith(PREFIX)  # the analyses warn of missing results
+        self._has_warned = self._quantity.name.startswith(
+            RESULT_PREFIX
+        )  # the analyses warn of missing results
 
     def next(self, history: History) -> Point | None:
         """The point of the next shot; the scanner is asked when all shots of the one before are there."""

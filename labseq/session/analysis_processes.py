@@ -16,9 +16,9 @@ from labseq.errors import DeviceError, LabseqError
 from labseq.files import check_ordinary
 from labseq.guard import StopFlag
 from labseq.messages import clean, did_you_mean, listing
+from labseq.recording.folders import RESULT_PREFIX
 from labseq.recording.results import (
     ERROR,
-    PREFIX,
     SHOT,
     Results,
     read_results,
@@ -76,7 +76,7 @@ class AnalysisProcesses(Analyses):
     ) -> None:
         super().__init__()
         self._analyses = analyses
-        self._needed = {name: why for name, why in needed.items() if name.startswith(PREFIX)}
+        self._needed = {name: why for name, why in needed.items() if name.startswith(RESULT_PREFIX)}
         self._analysis = {name: _analysis_of(name, analyses) for name in self._needed}
         self._observer = observer
         self._stop = stop
@@ -175,7 +175,7 @@ class AnalysisProcesses(Analyses):
     def _value(self, name: str, shot: int, row: Mapping[str, Any] | None) -> float | None:
         """The value in a row of the results; None, with a warning, if it has none."""
         analysis = self._analysis[name]
-        prefix = f"{PREFIX}{analysis[USE]}."
+        prefix = f"{RESULT_PREFIX}{analysis[USE]}."
         value = None if row is None else row.get(name.removeprefix(prefix))
         if isinstance(value, bool | int | float) and math.isfinite(value):
             return value
@@ -310,5 +310,5 @@ def _flags() -> int:
 
 def _analysis_of(name: str, analyses: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
     """The analysis whose results a quantity is one of; names may contain dots."""
-    found = [one for one in analyses if name.startswith(f"{PREFIX}{one[USE]}.")]
+    found = [one for one in analyses if name.startswith(f"{RESULT_PREFIX}{one[USE]}.")]
     return max(found, key=lambda one: len(str(one[USE])))

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 import shlex
+import shutil
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -21,6 +23,7 @@ from labseq.assembly.point import Point
 from labseq.assembly.wiring import unsuitable_exposures
 from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, ProblemCollector, one_of
 from labseq.guard import Guard
+from labseq.messages import visible
 from labseq.model import COMPUTER, Frame, Plan, TimelineEntry
 from labseq.motion import tone_program
 from labseq.roles import Detector, Step, find_leader
@@ -30,7 +33,7 @@ from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigg
 from labseq.sequencer.run import plan_timeline
 from labseq.session.prepared import PreparedRun
 from labseq.session.rehearsal import Rehearsal, quantile, rehearse, windows_of
-from labseq.units import format_quantity
+from labseq.units import format_quantity, size_text
 
 N_LOADINGS: Final = 200
 """Maximum number of random loadings for which the planner is run."""
@@ -113,6 +116,14 @@ class _PointCheck:
 
     def _add_to_profile(self, loc: Loc, what: str, expected: str = "", hint: str = "") -> None:
         self.checks.problems.add(self.point.hardware.document.error(loc, what, expected, hint))
+
+    def ask_settings(self) -> None:
+        """Have every device look for what its settings name, such as files."""
+        for name, device in self.lab.hardware():
+            chosen = self.point.hardware.chosen[name]
+            problems = self._guard.call(name, WARM_S, device.check_settings)
+            for setting, problem in problems.items():
+                self._add_to_profile((*chosen.loc, setting), problem.what, problem.expected, problem.hint)
 
     def ask_steps(self) -> None:
         """Have every step check its settings against the devices."""
@@ -293,6 +304,7 @@ class CheckReport:
         warnings: Settings that are allowed but probably not intended, with their place in the files.
         rehearsal: The planner's results for random loadings; None without a rearrangement.
         shot_bytes: Size of a shot on disk at most; None if the camera does not report its frame shape.
+        free_bytes: Free space on the disk of the data folder.
         lines: Name of each line -> when it is on in the longest shot, as (start, end) in seconds.
         idle_outputs: Name of each device that puts out something when nothing plays -> what.
     """
@@ -304,6 +316,7 @@ class CheckReport:
     warnings: tuple[Problem, ...]
     rehearsal: Rehearsal | None
     shot_bytes: int | None
+    free_bytes: int
     lines: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict[str, Any])
     idle_outputs: Mapping[str, str] = field(default_factory=dict[str, str])
 
@@ -348,6 +361,7 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         # the first points first, in whatever order the shots take them
         numbers = dict(sorted(numbers.items(), key=lambda item: min(item[1])))
         asks = (
+            _PointCheck.ask_settings,
             _PointCheck.ask_steps,
             _PointCheck.ask_timeline,
             _PointCheck.ask_timing,
@@ -365,6 +379,8 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         guard.end()
     rehearsals, bars = first.rehearsed, [bar for _, of_step in first.timeline for bar in of_step]
     warnings += _judgement_warnings(assembly, [*rehearsals])
+    shot_bytes, free_bytes = _shot_bytes(assembly, first.lab, bars), _free_bytes(run.root)
+    warnings += _disk_warnings(run, shot_bytes or 0, free_bytes)
     notes = [Problem(text) for text in (*assembly.warnings, *assembly.hardware.host.notes)]
     return CheckReport(
         first.timeline,
@@ -373,7 +389,8 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         run_s,
         (*notes, *warnings, *_light_warnings(assembly, first.lab)),
         next(iter(rehearsals.values()), None),
-        _shot_bytes(assembly, first.lab, bars),
+        shot_bytes,
+        free_bytes,
         spans_on(first.lab.line_specs, bars),
         {name: text for name, device in first.lab.hardware() if (text := device.idle_output)},
     )
@@ -533,7 +550,7 @@ def _parallelism_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Probl
     point = point_check.point
     asked = getattr(point.planner.settings, "degree_of_parallelism", None)
     limit = point.hardware.profile.motion.max_tweezers
-    if isinstance(asked, int) and asked > limit:
+    if point_check.windows and isinstance(asked, int) and asked > limit:  # else nothing is planned
         loc = (*point_check.checks.run.assembly.sequence.planner.loc, "degree_of_parallelism")
         what = f"degree_of_parallelism is {asked}, but the profile allows {limit} mobile tweezers at once"
         yield 0, point.document.problem(loc, f"{what}; at most {limit} are used")
@@ -589,3 +606,16 @@ def _shot_bytes(assembly: Assembly, lab: Lab, bars: Sequence[TimelineEntry]) -> 
         return None
     per_image = BYTES_PER_SITE * lab.grid.n_rows * lab.grid.n_cols
     return SHOT_OVERHEAD_BYTES + n_images * per_image + kept * 2 * math.prod(shape or (0,))
+
+
+def _free_bytes(folder: Path) -> int:
+    """Free space of the disk on which a folder is, or will be."""
+    return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
+
+
+def _disk_warnings(run: PreparedRun, shot_bytes: int, free_bytes: int) -> Iterator[Problem]:
+    """The shots that are still to be taken may need more than is free."""
+    if (n_bytes := len(run.history.to_take) * shot_bytes) > free_bytes:
+        what = f"the run may need {size_text(n_bytes)}, and the disk has {size_text(free_bytes)} free"
+        hint = "free some, choose another folder with --output, or keep fewer frames with record_frames"
+        yield Problem(what, visible(str(run.root)), hint=f"{hint}; a run that fills the disk can be resumed")

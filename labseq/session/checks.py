@@ -14,8 +14,8 @@ from labseq.config.sequence import CheckSettings
 from labseq.data.shot import CachingLoader, Shot
 from labseq.errors import CheckFailedError
 from labseq.model import TargetPattern
+from labseq.recording.folders import RESULT_PREFIX
 from labseq.recording.index import IndexRow
-from labseq.recording.results import PREFIX
 
 if TYPE_CHECKING:
     from labseq.data.quantities import Quantity
@@ -80,7 +80,7 @@ class Checks:
         self._analyses = analyses
         self._warn = warn
         self._load = CachingLoader()
-        self._unseen = {check.value for check in checks if not check.value.startswith(PREFIX)}
+        self._unseen = {check.value for check in checks if not check.value.startswith(RESULT_PREFIX)}
         self.left_open = -1, ""
         for row in rows:
             self._unseen.clear()  # the warning was given then

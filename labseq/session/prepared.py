@@ -120,6 +120,7 @@ class PreparedRun:
     Args:
         paced: Let virtual time pass at the speed of real time.
         observer: Receives every event.
+        root: The folder for the data.
         run: The run as it was before, if it is resumed.
         done: Its shots that are not taken again.
 
@@ -131,6 +132,7 @@ class PreparedRun:
         analyses: The analyses of its shots.
         history: The shots that were taken, and those still to take.
         points: Says where they are taken.
+        root: The folder for the data, absolute.
     """
 
     def __init__(
@@ -139,10 +141,12 @@ class PreparedRun:
         observer: RunObserver | None = None,
         *,
         paced: bool = False,
+        root: Path,
         run: Run | None = None,
         done: Collection[int] = (),
     ) -> None:
         self.assembly = assembly
+        self.root = root.absolute()  # some vendors' libraries change the working folder
         seed = assembly.sequence.seed if run is None else run.seed
         self.seed = secrets.randbits(63) if seed is None else seed
         self.stop_flag = StopFlag()

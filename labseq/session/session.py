@@ -172,7 +172,8 @@ class Session(PreparedRun):
         earlier: ResumableRun | None = None,
     ) -> None:
         before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
-        super().__init__(assembly, observer, paced=options.realtime, run=before, done=done)
+        root = earlier.root if earlier else options.output or data_root()
+        super().__init__(assembly, observer, paced=options.realtime, root=root, run=before, done=done)
         self.options = options
         self._notes = notes_file(options.note, options.tags)
         self.earlier = earlier
@@ -286,8 +287,6 @@ class Session(PreparedRun):
         for text in () if self.earlier is None else self.earlier.warnings:
             self.warn(text)
         reading = self._reading_code()
-        # before devices are opened: some vendors' libraries change the working folder
-        root = (self.earlier.root if self.earlier else self.options.output or data_root()).absolute()
         hardware, purpose = self.assembly.hardware, f"a run of {self.assembly.sequence.name}"
         with (
             stop_on_signals(self.stop_flag),
@@ -301,10 +300,10 @@ class Session(PreparedRun):
                 make_safe_after_crash(dead, hardware, self.stop_flag, self.observers)
             first = self.points.next(self.history)
             if first is None:  # its process died between the last shot and the end of the run
-                self._begin(root, first, reading)[1].finish("complete")
+                self._begin(first, reading)[1].finish("complete")
             else:
                 lab, warnings = self._checked(first)
-                with self._folder(root, first, reading, describe_locks) as (record, writer):
+                with self._folder(first, reading, describe_locks) as (record, writer):
                     for text in dict.fromkeys([*warnings, *hardware.host.notes]):
                         self.warn(text)
                     self._take_shots(lab, first, record, writer)
@@ -359,16 +358,16 @@ class Session(PreparedRun):
 
     @contextmanager
     def _folder(
-        self, root: Path, first: Point, reading: Future[RunCode], describe_locks: Callable[[str], None]
+        self, first: Point, reading: Future[RunCode], describe_locks: Callable[[str], None]
     ) -> Generator[tuple[RunRecord, RunWriter]]:
         """The run's folder, in which the way that the block ends is recorded."""
-        record, writer = self._begin(root, first, reading)
+        record, writer = self._begin(first, reading)
         describe_locks(f"the run {writer.run_dir}")
         error: BaseException | None = None
         with self.observers.logged_by(writer.event):
             if self.earlier is None and (day := later_day(writer.run_dir)):
                 self.warn(
-                    f"the clock may be wrong: {visible(str(root))} has runs of {day}, later than this one"
+                    f"the clock may be wrong: {visible(str(self.root))} has runs of {day}, after this one"
                 )
             try:
                 yield record, writer
@@ -437,9 +436,7 @@ class Session(PreparedRun):
         threads.shutdown(wait=False)
         return code
 
-    def _begin(
-        self, root: Path, first: Point | None, reading: Future[RunCode]
-    ) -> tuple[RunRecord, RunWriter]:
+    def _begin(self, first: Point | None, reading: Future[RunCode]) -> tuple[RunRecord, RunWriter]:
         """Create the run's folder, or reopen that of a resumed run; ``first`` is its next point, if any."""
         changes, earlier, code = self.options.changes(), self.earlier, reading.result()
         if not code.is_of(self.assembly.hardware.host):  # a planner that was constructed uses another's
@@ -448,7 +445,7 @@ class Session(PreparedRun):
         if earlier is None:
             extra_files = copies(self.assembly.hardware.calibrations) | self._notes
             extra_files |= {SOURCES_FILE: code.archive}
-            writer = RunWriter.create(root, record, extra_files, self.stop_flag)
+            writer = RunWriter.create(self.root, record, extra_files, self.stop_flag)
         else:
             first_shot = None if first is None else self.history.to_take[0]
             writer = earlier.reopen(record, code, first_shot, self.stop_flag)

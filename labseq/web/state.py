@@ -16,7 +16,7 @@ from typing import Any, Final, cast
 from labseq.analysis.timing import StageTotals
 from labseq.calibration_store import read_entry
 from labseq.console.events import event_text, point_of_shot
-from labseq.console.text import age_text, percent, plural, size_text
+from labseq.console.text import age_text, percent, plural
 from labseq.data import Shot
 from labseq.data.follower import Event
 from labseq.errors import ConfigError, LabseqError, RecordingError
@@ -25,6 +25,7 @@ from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.plain import now
 from labseq.recording.folders import INDEX_FILE, STOP_FILE
 from labseq.recording.run_file import read_state
+from labseq.units import size_text
 from labseq.web.history import Columns, judged_values
 from labseq.web.runs import OpenRun, notes_of, profile_of, text_of
 from labseq.web.scan import ScanView

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 from pydantic import Field
 
-from labseq.plugin import CameraFacts, ConfigError, Context, DeviceError, Duration, FilePath
+from labseq.plugin import CameraFacts, ConfigError, Context, DeviceError, Duration, FilePath, Problem
 from labseq.plugin.camera import CameraDriver, ExposureResult, OrientationSettings, Series
 from labseq_frames.files import BadFramesError, Picture, Source, find_source, format_shape
 
@@ -79,6 +79,14 @@ class FramesCamera(CameraDriver):
                 self._look()
         readout_s = self._settings.readout
         return CameraFacts(readout_s, MAX_EXPOSURE_S, self._image_shape, triggers=("software", "internal"))
+
+    def check_settings(self) -> Mapping[str, Problem]:
+        """Whether the files can be played, as far as the headers show."""
+        try:
+            self._look()
+        except BadFramesError as error:
+            return {"path": replace(error.problem, what=str(replace(error.problem, expected="", hint="")))}
+        return {}
 
     def describe(self) -> Mapping[str, Any]:
         """Settings, the files that were found, and the size of the frames."""
