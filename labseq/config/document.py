@@ -11,6 +11,7 @@ from labseq.config.addresses import Override, find
 from labseq.config.validation import ValidationContext, check, node_of, validate
 from labseq.config.yaml_nodes import Mark, Node, compose
 from labseq.errors import ConfigError, Loc, Problem, ProblemCollector, collecting
+from labseq.files import PLUGINS
 from labseq.messages import clean, shown, visible
 from labseq.settings import FORMAT, SettingsType, path_beside
 from labseq.text_files import decode, is_folder, read_bytes
@@ -279,8 +280,11 @@ def check_kind(document: Document, kind: FileKind) -> None:
 def plugin_paths(document: Document, folders: Sequence[str]) -> list[Path]:
     """The folders of ``plugin_folders``, relative to the file that names them.
 
+    Every file that ``labseq new`` makes names ``plugins``; a file that uses no plugin of it can be copied
+    without it.
+
     Raises:
-        ConfigError: One does not exist.
+        ConfigError: Another one does not exist.
     """
     paths = [path_beside(document.path.parent, folder) for folder in folders]
     problems = [
@@ -290,11 +294,11 @@ def plugin_paths(document: Document, folders: Sequence[str]) -> list[Path]:
             f"a folder at {visible(str(path))}",
         )
         for i, (folder, path) in enumerate(zip(folders, paths, strict=True))
-        if not is_folder(path)
+        if folder != PLUGINS and not is_folder(path)
     ]
     if problems:
         raise ConfigError(problems)
-    return paths
+    return [path for path in paths if is_folder(path)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -148,6 +148,16 @@ def advice(kind: str, name: str, file: Path | None) -> str:
     return ""
 
 
+def missing_folder(file: Path | None) -> str:
+    """A hint at the folder ``plugins`` that a file names and that was not copied along with it; or ""."""
+    with suppress(OSError, ValueError):
+        if file is None or (folder := file.parent / PLUGINS).is_dir():
+            return ""
+        if re.search(rf"^plugin_folders:.*\b{PLUGINS}\b", file.read_text("utf-8"), re.MULTILINE):
+            return f"its plugin folder {folder} does not exist"
+    return ""
+
+
 @dataclass(frozen=True, slots=True)
 class PluginInfo:
     """A plugin, and whether it was loaded.
@@ -407,7 +417,7 @@ class PluginHost:
                 return PluginLoadError(info.name, info.reason, info.source)
         known = self.registry.names(kind)
         hints = [f"did you mean '{near}'?" for near in difflib.get_close_matches(name, known, n=1)]
-        hints.append(advice(kind, name, file))
+        hints += [missing_folder(file), advice(kind, name, file)]
         # steps and patterns are mostly labseq's own: such a name is more likely misspelt
         if kind not in ("step", "pattern"):
             hints += [f"plugin '{info.name}' did not load ({info.reason})" for info in broken]

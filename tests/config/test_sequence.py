@@ -11,7 +11,8 @@ import labseq
 from labseq.config.addresses import Override
 from labseq.config.document import plugin_paths
 from labseq.config.sequence import SequenceSpec, StepSpec, load_sequence
-from labseq.errors import ConfigError
+from labseq.errors import ConfigError, UnknownPluginError
+from labseq.plugins.host import PluginHost
 
 DATA = Path(__file__).parent / "data"
 SMALL = "labseq: 1\nname: s\nshots: 1\ntarget: {pattern: compact}\nshot: [{load: {}}]\n"
@@ -113,6 +114,17 @@ def test_plugin_folders_are_beside_the_file(tmp_path: Path) -> None:
     assert (first.line, first.column) == (6, 24)
     assert str(second).startswith(f"{path}:6:46: ")
     assert str(second).endswith(str(tmp_path / "yours"))
+
+
+def test_the_folder_of_own_plugins_may_be_missing_where_none_is_used(tmp_path: Path) -> None:
+    path = tmp_path / "s.yaml"
+    path.write_text(SMALL + "plugin_folders: [plugins]\n", encoding="utf-8")
+    document, spec, _ = load_sequence(path)
+    assert plugin_paths(document, spec.plugin_folders) == []
+    with pytest.raises(UnknownPluginError, match=r"its plugin folder .* does not exist"):
+        PluginHost().get("planner", "mine", path)
+    (tmp_path / "plugins").mkdir()
+    assert plugin_paths(document, spec.plugin_folders) == [tmp_path / "plugins"]
 
 
 def test_analyses_have_their_place_and_their_time(tmp_path: Path) -> None:
