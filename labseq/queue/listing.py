@@ -185,6 +185,8 @@ def outcome_lines(queue: Queue, within: timedelta) -> list[str]:
         if some:
             names = ", ".join(f"{entry.id} {clean(entry.sequence.stem)}" for entry in some)
             lines.append(f"queue: {len(some)} {state}: {names}")
+            if state == "waiting":
+                lines.append("queue: 'labseq queue run' continues, with --keep-going also after a failure")
     return lines
 
 

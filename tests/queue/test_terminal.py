@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ import labseq
 from labseq.cli import main
 from labseq.errors import StopRequested
 from labseq.plain import now
+from labseq.queue.listing import outcome_lines
+from labseq.queue.queue import Queue
 from labseq.session.stopping import ask_to_stop
 from labseq.testing.fakes import RecordingObserver
 
@@ -78,6 +80,15 @@ def test_the_list_says_what_one_should_know(capsys: pytest.CaptureFixture[str]) 
     values = json.loads(call(capsys, "queue", "list", "--json")[1])["entries"][0]
     assert (values["state"], values["changed"], values["run_dir"]) == ("waiting", True, None)
     assert values["options"]["dry_run"] == "off"
+
+
+def test_what_still_waits_is_told_with_the_command_that_continues(capsys: pytest.CaptureFixture[str]) -> None:
+    call(capsys, "queue", "add", "s.yaml")
+    assert outcome_lines(Queue(Path("data")), timedelta(hours=1)) == [
+        "queue: 0 runs complete",
+        "queue: 1 waiting: 1 s",
+        "queue: 'labseq queue run' continues, with --keep-going also after a failure",
+    ]
 
 
 def test_a_queue_that_keeps_going_ends_with_the_first_failure(
