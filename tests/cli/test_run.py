@@ -173,7 +173,7 @@ def test_for_people(perform: Any) -> None:
 
 
 def test_options_reach_the_session(perform: Any, tmp_path: Path) -> None:
-    options = Options("lab", 3, 7, ("a.b=1", "c=2"), tmp_path, "fast", realtime=True)
+    options = Options("lab", 3, 7, ("a.b=1", "c=2"), tmp_path, "fast", True, "a note", ("a tag",))
     session, *_ = perform(options=options)
     given = {name: value for name, value in session.given.items() if name != "observer"}
     assert given == {
@@ -184,6 +184,8 @@ def test_options_reach_the_session(perform: Any, tmp_path: Path) -> None:
         "output": tmp_path,
         "dry_run": "fast",
         "realtime": True,
+        "note": "a note",
+        "tags": ("a tag",),
     }
 
 
