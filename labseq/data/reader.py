@@ -13,7 +13,6 @@ from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import read_lines
 from labseq.messages import clean
 from labseq.model import TargetPattern
-from labseq.model.estimate import mean
 from labseq.model.records import RunStatus
 from labseq.plain import to_plain
 from labseq.recording import folders
@@ -189,11 +188,15 @@ class Run:
     @property
     def defect_free(self) -> float:
         """Fraction of the shots that met the target, of those that were judged; nan without any."""
+        from labseq.model.estimate import mean  # a run itself does not need it
+
         return mean([shot.success for shot in self.shots if not math.isnan(shot.filling_fraction)]).value
 
     @property
     def filling_fraction(self) -> float:
         """Mean filling of the target over the shots that have one; nan without any."""
+        from labseq.model.estimate import mean
+
         return mean([f for shot in self.shots if not math.isnan(f := shot.filling_fraction)]).value
 
     @property

@@ -469,6 +469,7 @@ EVENTS: Final = {
     "leader_event": "what else the link to the external control system reports",
     "shot_repeated": "an attempt failed, and the shot is taken again",
     "shot_finished": "a shot is on disk, complete or not",
+    "clock_jumped": "the computer slept or its clock was set since the shot before; a reading, too",
     "shots_skipped": "a policy skipped shots, with the reason",
     "scan_point": "a shot of an adaptive scan is on disk: the point so far, and the best one",
     "scan_ended": "the scanner chose no further point",

@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from typing import Final
 
 from labseq.guard import StopFlag
+
+SLEPT: Final = "computer.slept_s"
+"""Reading of a shot before whose end the computer was suspended: for how long, since the shot before."""
+CLOCK_SET: Final = "computer.clock_set_s"
+"""Reading of a shot before whose end the computer's clock was set: by how much; where a system does not say
+that it slept, this is the sum of both."""
 
 
 class RealClock:
@@ -58,3 +66,40 @@ class PacedClock(VirtualClock):
         """Wait in real time, then advance virtual time by the same amount."""
         self._stop.wait(duration_s)
         super().sleep(duration_s)
+
+
+def _boot_s() -> float:
+    """A clock that goes on while the computer sleeps; that of Linux alone is compared with one that stops."""
+    number = getattr(time, "CLOCK_BOOTTIME", None)
+    return time.monotonic() if number is None else time.clock_gettime(number)
+
+
+class ClockJumps:
+    """Notices that the computer slept or that its clock was set.
+
+    Args:
+        wall_s: The computer's clock, which a user or a network may set.
+        monotonic_s: A clock that nobody sets, and that stops while the computer sleeps.
+        boot_s: The same, but it goes on while the computer sleeps.
+    """
+
+    def __init__(
+        self,
+        wall_s: Callable[[], float] = time.time,
+        monotonic_s: Callable[[], float] = time.monotonic,
+        boot_s: Callable[[], float] = _boot_s,
+    ) -> None:
+        self._clocks = wall_s, monotonic_s, boot_s
+        self._ahead_s = self._now()
+
+    def since_last(self) -> dict[str, float]:
+        """What happened since the last call, as readings of a shot; less than 1 s is drift of the clock."""
+        before, self._ahead_s = self._ahead_s, self._now()
+        slept_s, jumped_s = (now - then for now, then in zip(self._ahead_s, before, strict=True))
+        jumps = {SLEPT: slept_s, CLOCK_SET: jumped_s - slept_s}
+        return {name: round(jump_s, 3) for name, jump_s in jumps.items() if abs(jump_s) >= 1.0}
+
+    def _now(self) -> tuple[float, float]:
+        """By how much the clocks of sleep and of the wall are ahead of the one that stops."""
+        wall_s, monotonic_s, boot_s = (clock() for clock in self._clocks)
+        return boot_s - monotonic_s, wall_s - monotonic_s

@@ -7,7 +7,6 @@ Each alarm warns when it begins; after some shots in a row it ends the run, so t
 from __future__ import annotations
 
 import math
-import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -20,6 +19,7 @@ from labseq.config.profile import AlarmSettings
 from labseq.errors import AlarmError
 from labseq.messages import clean
 from labseq.model import ShotRecord, follow_atoms
+from labseq.sequencer.clock import CLOCK_SET, SLEPT
 from labseq.units import format_quantity
 
 COMPARED: Final = 20
@@ -67,22 +67,12 @@ class Alarms:
     Args:
         settings: The limits; None for no alarms.
         warn: Receives its name and a message when an alarm begins.
-        wall_s: The computer's clock, which a user or a network may set.
-        monotonic_s: A clock that nobody sets, and that stands still while the computer sleeps.
     """
 
-    def __init__(
-        self,
-        settings: AlarmSettings | None,
-        warn: Callable[[str, str], None],
-        wall_s: Callable[[], float] = time.time,
-        monotonic_s: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, settings: AlarmSettings | None, warn: Callable[[str, str], None]) -> None:
         self._settings = settings or AlarmSettings()
         self._is_on = settings is not None
         self._warn = warn
-        self._clocks = wall_s, monotonic_s
-        self._difference_s = wall_s() - monotonic_s()
         self._in_a_row: dict[str, int] = {}
         self._texts: dict[str, str] = {}
         self._frame: NDArray[np.uint16] | None = None
@@ -119,7 +109,7 @@ class Alarms:
         yield from self._first_image(shot)
         yield from self._detection(shot)
         yield from self._moves(shot)
-        yield from self._clock()
+        yield from self._clock(shot)
 
     def _frames(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
         # the first and the last image tell it, and the others of a long shot would take time
@@ -179,12 +169,13 @@ class Alarms:
                     what = f"{arrived.n} of {arrived.n_of} moved atoms arrived{arrived.shots}"
                     yield "arrived", f"{what}; check light, trigger and overlay of the mobile tweezers"
 
-    def _clock(self) -> Iterator[tuple[str, str]]:
-        wall_s, monotonic_s = self._clocks
-        difference_s = wall_s() - monotonic_s()
-        jump_s, self._difference_s = difference_s - self._difference_s, difference_s
-        if abs(jump_s) > self._settings.clock:
-            what = f"the computer's clock has jumped by {format_quantity(jump_s, 'time')}"
+    def _clock(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
+        slept_s, set_s = (shot.readings.get(name, 0.0) for name in (SLEPT, CLOCK_SET))
+        if slept_s > self._settings.clock:
+            slept = format_quantity(slept_s, "time")
+            yield "clock", f"the computer slept for {slept}; let it never suspend by itself"
+        elif abs(set_s) > self._settings.clock:
+            what = f"the computer's clock has jumped by {format_quantity(set_s, 'time')}"
             yield "clock", f"{what}: it was set, or the computer slept"
 
 

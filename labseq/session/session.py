@@ -26,6 +26,7 @@ from labseq.recording.folders import NOTIFY_FILE, SOURCES_FILE, later_day
 from labseq.recording.index import IndexRow
 from labseq.roles import RunObserver
 from labseq.safety.locks import lock_devices
+from labseq.sequencer.clock import ClockJumps
 from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer, State
 from labseq.session.alarms import Alarms
@@ -78,6 +79,7 @@ class Shots:
         assembly = run.assembly
         limits = assembly.hardware.profile.alarms if assembly.sequence.alarms else None
         self._alarms = Alarms(limits, self._warn_of)
+        self._clock_jumps = ClockJumps()
         self.sequencer = Sequencer(
             lab,
             first.steps,
@@ -94,7 +96,11 @@ class Shots:
         self._run.observers.event("warning", {"text": text, "alarm": alarm})
 
     def write_shot(self, shot: ShotRecord) -> IndexRow:
-        """Write a shot, and look for alarms while its frames are there."""
+        """Write a shot with the jumps of clocks that it saw; look for alarms while its frames are there."""
+        if jumps := self._clock_jumps.since_last():
+            shot.readings |= jumps
+            about = {"shot": shot.shot_index, "attempt": shot.attempt}
+            self._run.observers.event("clock_jumped", {**about, **jumps})
         row = self._writer.write_shot(shot)
         self._alarms.look(shot)
         return row

@@ -12,6 +12,7 @@ import labseq
 from labseq.config.profile import AlarmSettings
 from labseq.errors import AlarmError
 from labseq.model import Frame, ImageRecord, ShotRecord
+from labseq.sequencer.clock import ClockJumps
 from labseq.session.alarms import Alarms
 from labseq.testing.fakes import RecordingObserver
 
@@ -32,19 +33,17 @@ def image(n_atoms: int = 1200, confidence: float = 1.0, counts: Any = None) -> I
 
 
 class Watched:
-    """Alarms whose warnings are kept, with clocks that a test sets."""
+    """Alarms whose warnings are kept, of shots that a test makes."""
 
     def __init__(self, **settings: Any) -> None:
         self.warnings: list[str] = []
-        self.wall_s = self.monotonic_s = 0.0
-        clocks = lambda: self.wall_s, lambda: self.monotonic_s
-        self.alarms = Alarms(AlarmSettings(**settings), lambda _, text: self.warnings.append(text), *clocks)
+        self.alarms = Alarms(AlarmSettings(**settings), lambda _, text: self.warnings.append(text))
         self.n = 0
 
-    def shot(self, *images: ImageRecord, status: Any = "complete") -> list[str]:
+    def shot(self, *images: ImageRecord, status: Any = "complete", readings: Any = ()) -> list[str]:
         """Look at a shot; returns the names of the alarms that began."""
         record, n_before = ShotRecord(self.n, 0, 1, ""), len(self.warnings)
-        record.images, record.status = list(images), status
+        record.images, record.status, record.readings = list(images), status, dict(readings)
         self.n += 1
         self.alarms.look(record)
         return [text.split("'")[1] for text in self.warnings[n_before:]]
@@ -107,14 +106,22 @@ def test_few_sites_are_judged_over_several_shots() -> None:
     assert "0 atoms on the first image, at 108 sites, in the last 12 shots" in watched.warnings[0]
 
 
-def test_a_clock_that_jumps_is_an_alarm() -> None:
+def test_sleep_and_a_clock_that_is_set_are_readings_of_the_shot_that_saw_them_and_alarms() -> None:
+    wall_s, monotonic_s, boot_s = 1e9, 100.0, 100.0
+    jumps = ClockJumps(lambda: wall_s, lambda: monotonic_s, lambda: boot_s)
+    wall_s, monotonic_s, boot_s = wall_s + 30.5, monotonic_s + 30.0, boot_s + 30.0  # a shot; the clock drifts
+    assert jumps.since_last() == {}
+    wall_s, boot_s = wall_s + 3600.0, boot_s + 3600.0
+    slept = jumps.since_last()
+    assert slept == {"computer.slept_s": 3600.0}
+    wall_s -= 7200.0
+    was_set = jumps.since_last()
+    assert was_set == {"computer.clock_set_s": -7200.0}
+    assert jumps.since_last() == {}
     watched = Watched()
-    watched.wall_s = watched.monotonic_s = 100.0
-    assert watched.shot(image()) == []
-    watched.wall_s += 3600.0  # the computer slept, or its clock was set
-    assert watched.shot(image()) == ["clock"]
-    assert "jumped by 1 h" in watched.warnings[-1] or "3600 s" in watched.warnings[-1]
-    assert watched.shot(image()) == []
+    for readings, words in ((slept, "slept for 3600 s"), ({}, ""), (was_set, "jumped by -7200 s")):
+        assert watched.shot(image(), readings=readings) == ["clock"] * bool(readings)
+        assert words in "".join(watched.warnings[-1:])
 
 
 def test_an_alarm_warns_once_and_ends_the_run_after_some_shots_in_a_row() -> None:
