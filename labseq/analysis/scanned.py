@@ -95,7 +95,11 @@ class ScanReport:
             tables = self.table()
         if not axes:
             tables = ["the run has no scan: these are all its shots", "", *tables]
-        return [*tables, *(line for fits in self.fits if fits for line in ("", *fit_lines(fits)))]
+        lines: list[str] = []
+        for (quantity, _), fits in zip(self.values, self.fits, strict=False):
+            if fits:
+                lines += ["", *fit_lines(fits, f" of {title_of(quantity)}" if len(self.values) > 1 else "")]
+        return [*tables, *lines]
 
     def table(self, most: int = 0) -> list[str]:
         """A row for each point.
@@ -194,7 +198,12 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
     fit = request.fit
     fits: tuple[list[FitAt], ...] = ()
     if fit is not None:
-        fits = tuple(fits_along(run, scan, quantity, means, fit) for quantity, means in values)
+        # without a name, that of the first: a model suits one quantity, and not those beside it
+        wanted = quantities if request.names else quantities[:1]
+        fits = tuple(
+            fits_along(run, scan, quantity, means, fit) if quantity in wanted else []
+            for quantity, means in values
+        )
     elif not request.names:
         fits = tuple(own_fits(run, scan, quantity, means) for quantity, means in values)
     return ScanReport(scan, values, fits)
@@ -242,13 +251,18 @@ def _doubt(fit: Fit) -> str:
     return f" (reduced chi-square {fit.reduced_chi_square:.2g}: the points do not follow the model)"
 
 
-def fit_lines(fits: Sequence[FitAt]) -> list[str]:
-    """A fit with a line for each parameter; several as a table, with the reasons of those that failed."""
+def fit_lines(fits: Sequence[FitAt], of: str = "") -> list[str]:
+    """A fit with a line for each parameter; several as a table, with the reasons of those that failed.
+
+    Args:
+        fits: The fit, or those at each value of the other axes.
+        of: What is fitted, if it must be named: " of filling".
+    """
     made = [at.fit for at in fits if at.fit is not None]
     if not made:
         return [fits[0].problem]
     if not fits[0].values:
-        return made[0].lines()
+        return made[0].lines(of)
     names = list(dict.fromkeys(name for fit in made for name in fit.free))
     rows = [(*fits[0].written, *names, "chi-square")]
     for at in fits:
@@ -257,7 +271,7 @@ def fit_lines(fits: Sequence[FitAt]) -> list[str]:
             results = [str(at.fit.parameters[name]) for name in names] + [f"{at.fit.reduced_chi_square:.2f}"]
         rows.append((*at.written.values(), *results))
     failed = [f"{', '.join(at.written.values())}: {at.problem}" for at in fits if at.problem]
-    return [f"fit {made[0].model}: {made[0].formula}", *aligned(rows, right=range(len(rows[0]))), *failed]
+    return [f"fit {made[0].model}{of}: {made[0].formula}", *aligned(rows, right=range(len(rows[0]))), *failed]
 
 
 def title_of(quantity: Quantity) -> str:

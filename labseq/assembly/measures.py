@@ -6,10 +6,10 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 from labseq.config.document import Document
-from labseq.config.sequence import SequenceSpec, StepSpec
+from labseq.config.sequence import SequenceSpec
 from labseq.errors import Loc, ProblemCollector
 from labseq.model import TargetPattern
-from labseq.model.records import unique_names
+from labseq.model.image_quantities import StepSummary, measured_by_default
 from labseq.plugins.host import PluginHost
 from labseq.roles import Step
 
@@ -43,7 +43,12 @@ def make_measures(
     """
     checked = steps if len(steps) == len(sequence.shot) else None
     if sequence.measure is None:
-        return [{"value": name} for name in default_measures(sequence.shot, checked or (), target)]
+        summaries = [
+            StepSummary(name, step.takes_image, spec.kind == "load")
+            for spec, (name, step) in zip(sequence.shot, checked or (), strict=False)
+        ]
+        has_target = target is not None and not target.is_none
+        return [{"value": name} for name in measured_by_default(summaries, has_target=has_target)]
     from labseq.assembly.quantities import check_quantity  # loads what other runs do not need
 
     for number, measure in enumerate(sequence.measure):
@@ -55,17 +60,3 @@ def make_measures(
 
                 check_fit(document, sequence, scan, number, target, host)
     return [measure.model_dump(mode="json", exclude_defaults=True) for measure in sequence.measure]
-
-
-def default_measures(shot: Sequence[StepSpec], steps: Steps, target: TargetPattern | None) -> tuple[str, ...]:
-    """What a run without ``measure`` is about: its array, or without a target the survival of its atoms."""
-    if target is not None and not target.is_none:
-        return "filling", "defect_free"
-    names = unique_names([name for name, _ in steps])
-    images = [i for i, (_, step) in enumerate(steps) if step.takes_image]
-    if len(images) < 2:
-        return ("loading",) if images else ()
-    first, last = images[-2:]
-    if any(spec.kind == "load" for spec in shot[first:last]):
-        return (f"loading:{names[last]}",)
-    return (f"survival:{names[first]},{names[last]}",)

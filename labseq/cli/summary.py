@@ -26,7 +26,7 @@ from labseq.console.text import count_of, plural, quoted
 from labseq.data import Run
 from labseq.data.best import BestPoint, best_point
 from labseq.data.follower import Follower
-from labseq.data.quantities import WITH_TARGET, WITHOUT_TARGET, Quantity, measured_by, quantity_of
+from labseq.data.quantities import WITH_TARGET, Quantity, measured_by, quantity_of
 from labseq.data.scanned import scanned
 from labseq.errors import StopRequested
 from labseq.messages import clean, one_line
@@ -212,7 +212,7 @@ def _atom_rows(n_atoms: Sequence[Estimate]) -> Facts:
 
 def _measured_rows(measured: Sequence[tuple[Quantity, Estimated]]) -> Facts:
     """What a run measures over all its shots; what has rows of its own is left out."""
-    own = (one for one in measured if one[0].name not in (*WITH_TARGET, *WITHOUT_TARGET))
+    own = (one for one in measured if one[0].name not in WITH_TARGET)
     return [(title_of(quantity), value_text(mean, quantity)) for quantity, mean in own]
 
 

@@ -97,9 +97,22 @@ def _as_mapping(value: Any) -> Any:
     return {"value": value} if isinstance(value, str) else value
 
 
-Measures: TypeAlias = Annotated[
-    tuple[Annotated[MeasureSettings, BeforeValidator(_as_mapping)], ...] | None, Field(min_length=1)
-]
+def _as_list(value: Any) -> Any:
+    return [value] if isinstance(value, str | dict) else value
+
+
+def _each_once(measures: tuple[MeasureSettings, ...]) -> tuple[MeasureSettings, ...]:
+    names = [measure.value for measure in measures]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            expected = "each quantity once; `labseq show --scan QUANTITY --fit MODEL` fits it with others"
+            raise setting_error(f"'{clean(name)}' is listed a second time", expected, at=(i,))
+    return measures
+
+
+_Measure = Annotated[MeasureSettings, BeforeValidator(_as_mapping)]
+_MeasureList = Annotated[tuple[_Measure, ...], Field(min_length=1), AfterValidator(_each_once)]
+Measures: TypeAlias = Annotated[_MeasureList | None, BeforeValidator(_as_list)]
 """What a run measures, the most important first; None to choose it by the steps."""
 
 

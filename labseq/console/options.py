@@ -228,9 +228,9 @@ FitName = Annotated[
     typer.Option(
         "--fit",
         metavar="MODEL",
-        help="Fit the quantity against the scanned value: exponential, double_exponential, damped_cosine, "
-        "gaussian, lorentzian, linear, polynomial, saturation, step, plateau, lowering, release_recapture or "
-        "one of a plugin.",
+        help="Fit the quantity, by default the first that the run measures, against the scanned value: "
+        "exponential, double_exponential, damped_cosine, gaussian, lorentzian, linear, polynomial, "
+        "saturation, step, plateau, lowering, release_recapture or one of a plugin.",
     ),
 ]
 Along = Annotated[

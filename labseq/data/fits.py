@@ -123,13 +123,17 @@ class Fit:
         """The parameters that were not fixed."""
         return {name: parameter for name, parameter in self.parameters.items() if parameter.error}
 
-    def lines(self) -> list[str]:
-        """The result, a line for each parameter."""
+    def lines(self, of: str = "") -> list[str]:
+        """The result, a line for each parameter.
+
+        Args:
+            of: What was fitted, if it must be named: " of filling".
+        """
         has_errors = math.isfinite(self.reduced_chi_square)
         chi2 = f"{self.reduced_chi_square:.2f}" if has_errors else "-, the points have no errors"
         width = max(map(len, (*self.parameters, "chi-square")))
         return [
-            f"fit {self.model}: {self.formula}",
+            f"fit {self.model}{of}: {self.formula}",
             *(f"  {name.ljust(width)}  {parameter}" for name, parameter in self.parameters.items()),
             f"  {'chi-square'.ljust(width)}  {chi2} (reduced, {len(self.x)} points)",
         ]

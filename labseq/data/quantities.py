@@ -23,9 +23,11 @@ from labseq.model.image_quantities import (
     OF_IMAGES,
     SITES,
     Events,
+    StepSummary,
     events_of,
     find_image,
     mask_of,
+    measured_by_default,
     measured_in,
     parse_name,
 )
@@ -129,7 +131,7 @@ def _in_index(name: str, row: IndexRow, target: TargetPattern) -> Events | None:
 def quantity_problem(
     name: str,
     columns: Collection[str],
-    images: Collection[str],
+    images: Sequence[str],
     target: TargetPattern | None,
     open_prefixes: tuple[str, ...] = (),
 ) -> tuple[str, str, str] | None:
@@ -160,6 +162,11 @@ def quantity_problem(
             near = closest(image, images)
             problem = f"there is no image '{clean(image)}' for '{clean(name)}'"
             return problem, f"one of {', '.join(images)}", f"did you mean '{near}'?" if near else ""
+    places = [images.index(image) for image in named if image in images]
+    if kind == "survival" and len(places) == 2 and places[0] >= places[1]:
+        return f"'{clean(name)}' goes from an image to one that is not later", "the earlier image first", ""
+    if kind in WITH_TARGET and target is not None and target.is_none:
+        return f"there is no '{clean(name)}': the run has no target", "loading or survival, or a target", ""
     return None if target is None else _sites_problem(name, sites, target)
 
 
@@ -226,8 +233,7 @@ def find_quantity(run: Run, name: str) -> Quantity:
 
 
 WITH_TARGET: Final = ("filling", "defect_free")
-WITHOUT_TARGET: Final = ("n_loaded", "n_atoms")
-"""What a run of an earlier version is taken to measure, with a target and without one."""
+"""What a run with a target measures if its sequence does not say it."""
 
 
 def measures_of(run: Run) -> Sequence[Mapping[str, Any]]:
@@ -242,7 +248,14 @@ def measured_by(run: Run) -> tuple[str, ...]:
 
 def names_measured(resolved: Mapping[str, Any], target: TargetPattern) -> tuple[str, ...]:
     """The same, from the settings and the target of a run."""
-    return measured_in(resolved) or (WITHOUT_TARGET if target.is_none else WITH_TARGET)
+    if names := measured_in(resolved):
+        return names
+    steps: list[StepSummary] = []
+    for step in resolved.get("shot", ()):  # of an earlier version: kind -> settings, with a name
+        kind = next((key for key in step if key not in ("name", "policy")), "")
+        steps.append(StepSummary(step.get("name") or kind, kind == "image", kind == "load"))
+    # shots without images have that at least
+    return measured_by_default(steps, has_target=not target.is_none) or ("duration_s",)
 
 
 def quantity_of(run: Run, name: str) -> Quantity:

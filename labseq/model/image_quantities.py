@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 import numpy as np
 
 from labseq.model.grid import Occupancy, TargetPattern
-from labseq.model.records import CycleRecord, ImageRecord, follow_atoms
+from labseq.model.records import CycleRecord, ImageRecord, follow_atoms, unique_names
 
 Events = tuple[float, float]
 """A value and 1, or a number of events and the number of trials; 0 trials without a value."""
@@ -222,6 +222,40 @@ OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
     ),
 }
 """The kinds, by the beginning of their names."""
+
+
+class StepSummary(NamedTuple):
+    """What a step of a shot means for its images.
+
+    Attributes:
+        name: Its name.
+        takes_image: Whether it takes one.
+        loads: Whether it loads atoms.
+    """
+
+    name: str
+    takes_image: bool
+    loads: bool
+
+
+def measured_by_default(steps: Sequence[StepSummary], *, has_target: bool) -> tuple[str, ...]:
+    """What a run without ``measure`` is about: its array, or without a target the survival of its atoms.
+
+    Example:
+        >>> steps = [("load", False, True), ("a", True, False), ("wait", False, False), ("b", True, False)]
+        >>> measured_by_default([StepSummary(*step) for step in steps], has_target=False)
+        ('survival:a,b',)
+    """
+    if has_target:
+        return "filling", "defect_free"
+    names = unique_names([step.name for step in steps])
+    images = [i for i, step in enumerate(steps) if step.takes_image]
+    if len(images) < 2:
+        return ("loading",) if images else ()
+    first, last = images[-2:]
+    if any(step.loads for step in steps[first:last]):
+        return (f"loading:{names[last]}",)
+    return (f"survival:{names[first]},{names[last]}",)
 
 
 def measured_in(resolved: Mapping[str, Any]) -> tuple[str, ...]:

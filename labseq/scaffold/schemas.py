@@ -265,9 +265,8 @@ class _FileSchema:
         self._fill(keys, "planner", or_empty(self._choice("planner", Choice)))
         self._fill(keys, "analysis", or_empty(analyses))
         listed: JsonSchema = keys["measure"]["anyOf"][0]  # an item may be the name alone
-        self._fill(
-            keys, "measure", or_empty({**listed, "items": {"anyOf": [listed["items"], {"type": "string"}]}})
-        )
+        item: JsonSchema = {"anyOf": [listed["items"], {"type": "string"}]}
+        self._fill(keys, "measure", or_empty({"anyOf": [{**listed, "items": item}, *item["anyOf"]]}))
         self._fill(keys, "shot", {"type": "array", "minItems": 1, "items": self._step()})
         self._fill(keys, "scan", or_empty(self._scan()))
         # there is a default planner, and a scan sets the number of shots

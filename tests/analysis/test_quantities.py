@@ -11,12 +11,14 @@ import pytest
 from labseq_virtual.flight import KELVIN, draw_atoms
 
 import labseq
-from labseq.analysis.overview import map_picture
+from labseq.analysis.overview import map_picture, scan_picture
+from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.cli import main
 from labseq.data.fit_models import MODELS, RB87_U
 from labseq.data.fits import fit_points
 from labseq.data.points import scan_points
 from labseq.data.quantities import select_shots
+from labseq.data.scanned import FitRequest
 from labseq.data.site_maps import site_map
 from labseq.errors import ConfigError
 from labseq.model.estimate import Estimate, Estimated, Rate
@@ -209,3 +211,11 @@ def test_maps_of_sites_add_up_to_the_quantity(lifetime: labseq.Run, tmp_path: Pa
     assert [len(row) for row in picture.rows] == [2, 2]
     with pytest.raises(ConfigError, match="'n_atoms' has one value in each shot, and none for a site"):
         site_map(lifetime, "n_atoms")
+
+
+def test_without_a_name_the_first_quantity_is_fitted_and_named(lifetime: labseq.Run) -> None:
+    """The run measures its filling and defect-free shots; of the latter no fit can be made."""
+    report = scan_report(lifetime, ScanRequest((), FitRequest("exponential", {})))
+    assert [len(fits) for fits in report.fits] == [1, 0]
+    assert sum(line.startswith("fit exponential of filling: ") for line in report.as_text()) == 1
+    assert len(scan_picture(lifetime, ScanRequest((), FitRequest("exponential", {}))).rows[0]) == 2

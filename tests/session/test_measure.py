@@ -46,12 +46,20 @@ def message(tmp_path: Path, text: str) -> str:
         (HEAD + "shot: [{load: {}}, {image: {}}]\n", ["loading"]),
         (HEAD + "shot: [{load: {}}, {image: {}}, {load: {}}, {name: b, image: {}}]\n", ["loading:b"]),
         (HEAD + "shot: [{wait: {duration: 1 s}}]\n", []),
+        (HEAD + "measure: survival:0,1\n" + SURVIVAL, ["survival:0,1"]),
         (HEAD + "measure: ['filling:before@0:10,:']\n" + ARRAY, ["filling:before@0:10,:"]),
     ],
 )
 def test_without_measure_the_steps_say_it(tmp_path: Path, text: str, names: list[str]) -> None:
     with opened(tmp_path, text) as session:
         assert [one["value"] for one in session.assembly.resolved["measure"]] == names
+
+
+def test_runs_of_earlier_versions_measure_what_their_steps_say(tmp_path: Path) -> None:
+    with opened(tmp_path, HEAD + SURVIVAL) as session:
+        run = session.run()
+    del run.record["resolved"]["measure"]
+    assert measured_by(run) == ("survival:before,after",)
 
 
 def test_some_sites_are_measured(tmp_path: Path) -> None:
@@ -83,7 +91,11 @@ def test_some_sites_are_measured(tmp_path: Path) -> None:
         ("measure: [loading@]", "5:11: 'loading@' names no sites after the '@' to measure"),
         ("measure: [loading@left]", "5:11: 'left' names no sites to measure"),
         ("measure: []", "5:10: "),
-        ("measure: loading", "5:10: measure is 'loading'"),
+        ("measure: loadin", "5:10: there is no quantity 'loadin' to measure"),
+        ("measure: [loading, survival, loading]", "5:30: 'loading' is listed a second time"),
+        ("measure: ['survival:before,before']", "goes from an image to one that is not later to measure"),
+        ("measure: ['survival:after,before']", "expected the earlier image first"),
+        ("measure: [filling]", "5:11: there is no 'filling': the run has no target to measure"),
         ("measure: [{value: loading, fit: gausian}]", "5:33: there is no model 'gausian'"),
         (
             "measure: [{value: loading, report: decay}]",
