@@ -287,6 +287,7 @@ PARTS: Final[Mapping[str, Callable[..., list[Block]]]] = {
     "columns": reference.columns,
     "attributes": attributes,
     "index": reference.index_keys,
+    "words": reference.words,
 }
 """Name of a part -> makes it."""
 

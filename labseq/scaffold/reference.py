@@ -31,6 +31,7 @@ from labseq.messages import clean, closest
 from labseq.model.policies import StepPolicy
 from labseq.registry import Entry, Registry
 from labseq.roles import EVENTS, ROLES
+from labseq.scaffold.printed import COLUMNS, OUTCOMES, STAGES
 from labseq.scaffold.words import default_of, docstring, summary, value_of
 from labseq.settings import Choice, Setting, SettingsType, has_settings, models_at, settings_of
 from labseq.units import EXAMPLES, UNITS, unit_names
@@ -350,6 +351,18 @@ def quantities() -> list[Block]:
     return [_named("quantity", rows | {f"{prefix}NAME": about for prefix, about in GROUPS.items()})]
 
 
+def words() -> list[Block]:
+    """Tables of the words that commands print."""
+    return [_named("word", OUTCOMES), _named("word", STAGES), _named("word", COLUMNS)]
+
+
+def fits() -> list[Block]:
+    """A row per model that a scan can be fitted with."""
+    from labseq.data.fit_models import MODELS
+
+    return [_named("fit", {name: model.formula for name, model in MODELS.items()})]
+
+
 # Commands
 
 _COMPARISONS: Final = {">=": "At least", "<=": "At most", ">": "More than", "<": "Less than"}
@@ -422,6 +435,8 @@ _TABLES: Final[Mapping[str, tuple[str, Callable[[], list[Block]]]]] = {
     "event": ("what happens in a run, as in events.jsonl", events),
     "rule": ("rules that every plan is checked against", plan_rules),
     "exit": ("exit codes of the commands", exit_codes),
+    "fit": ("models for the points of a scan", fits),
+    "word": ("words that the commands print: heads of columns, names of rows, stages", words),
 }
 """First word of topics -> what they are, and a table with a row for each of them."""
 _LISTED: Final = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -9,14 +10,17 @@ from types import FunctionType
 from typing import Any
 
 import pytest
+from labseq_virtual.tweezer_kernels import CAUSES
 from pydantic import create_model
 
 import labseq
 from labseq import errors, plugin, roles, testing
+from labseq.cli import live
 from labseq.config.profile import ProfileSpec, load_profile
 from labseq.config.sequence import SequenceSpec, load_sequence
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import EXIT_CODES, exit_code_of
+from labseq.data.fit_models import MODELS as FITS
 from labseq.model.policies import StepPolicy
 from labseq.plugin import simulation, system
 from labseq.registry import Registry
@@ -108,6 +112,32 @@ def test_every_topic_can_be_explained() -> None:
         is_table = [not isinstance(block, reference.Code) for block in topic.blocks()]
         assert all(is_table) <= (max(map(len, lines)) <= 80), name
         assert "`" not in "".join(lines), name
+
+
+def printed_words() -> set[str]:
+    """Heads of columns and names of rows, as the code that prints them has them."""
+    words = {*live.STAGES, *FITS, *(cause.replace("_", " ") for cause in CAUSES)}
+    for file in Path(labseq.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            match node:
+                case ast.Call(
+                    func=ast.Name("Column") | ast.Attribute(attr="add_column" | "add_row"),
+                    args=[ast.Constant(str(word)), *_],
+                ):
+                    words.add(word)
+                case ast.FunctionDef(returns=ast.Name("Facts")):
+                    pairs = [one.elts for one in ast.walk(node) if isinstance(one, ast.Tuple)]
+                    words |= {str(pair[0].value) for pair in pairs if isinstance(pair[0], ast.Constant)}
+                case _:
+                    pass
+    return words - {""}
+
+
+def test_every_printed_word_can_be_explained() -> None:
+    topics = reference.topics(SCRIPT.registry(), SCRIPT.PROGRAM)
+    for word in printed_words():
+        names = [name.lower().replace(".", " ") for name in reference.find(topics, word)]
+        assert any(name.endswith(word.lower()) for name in names), word
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: f"{model.__module__}.{model.__name__}")
