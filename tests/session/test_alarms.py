@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from labseq_virtual.camera import VirtualCamera
+from labseq_virtual.simulation import VirtualSimulation
 
 import labseq
 from labseq.config.profile import AlarmSettings
@@ -16,6 +20,7 @@ from labseq.sequencer.clock import ClockJumps
 from labseq.session.alarms import Alarms
 from labseq.testing.fakes import RecordingObserver
 
+from .small_runs import PROFILE
 from .whole_runs import SMALL_FRAMES
 
 RNG = np.random.default_rng(7)
@@ -181,3 +186,71 @@ def test_a_run_without_atoms_ends_and_can_be_resumed(tmp_path: Path) -> None:
 def test_moved_atoms_that_do_not_arrive_are_an_alarm(tmp_path: Path) -> None:
     warnings, _, _ = run(tmp_path, 1, "profile.mobile_tweezers.speed=2000 um/ms")
     assert any("'arrived'" in text and "moved atoms arrived" in text for text in warnings)
+
+
+ONE_IMAGE = """labseq: 1
+name: seen
+profile: ./p.yaml
+shots: 14
+seed: 1
+shot:
+  - load: {duration: 500 ms}
+  - image: {exposure: 45 ms}
+"""
+
+
+class Broken:
+    """A lab that breaks after ten shots, in the way that an alarm is for."""
+
+    def __init__(self, alarm: str, patch: pytest.MonkeyPatch) -> None:
+        self.n, self.first = 0, None
+        read, load, look = VirtualCamera.read, VirtualSimulation.load, Alarms.look
+
+        def read_frame(camera: VirtualCamera, timeout_s: float) -> Frame:
+            seen = read(camera, timeout_s)
+            self.first = self.first or seen
+            pixels = {"saturated": np.full_like(seen.image, 65535), "frozen": self.first.image}
+            return replace(seen, image=pixels.get(alarm, seen.image)) if self.n >= 10 else seen
+
+        def load_atoms(simulation: VirtualSimulation, *times: float) -> None:
+            if self.n < 10 or alarm != "loading":
+                load(simulation, *times)
+
+        def count(alarms: Alarms, shot: ShotRecord) -> None:
+            look(alarms, shot)
+            self.n += 1
+            if self.n == 10 and alarm == "clock":
+                patch.setattr(alarms, "_difference_s", -3600.0)
+
+        patch.setattr(VirtualCamera, "read", read_frame)
+        patch.setattr(VirtualSimulation, "load", load_atoms)
+        patch.setattr(Alarms, "look", count)
+
+
+@pytest.mark.parametrize(
+    ("alarm", "overrides"),
+    [
+        ("saturated", ["profile.alarms.full=0", "profile.alarms.frozen=false"]),
+        ("frozen", []),
+        ("loading", ["profile.alarms.atoms=0"]),
+        ("clock", []),
+        ("full", ["profile.simulation.loading=100%"]),
+        ("confidence", ["profile.detector.width=1000", "shots=40"]),
+    ],
+)
+def test_a_run_that_breaks_gives_its_alarm_and_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alarm: str, overrides: list[str]
+) -> None:
+    (tmp_path / "p.yaml").write_text(PROFILE, encoding="utf-8")
+    (tmp_path / "seen.yaml").write_text(ONE_IMAGE, encoding="utf-8")
+    Broken(alarm, monkeypatch)
+    observer = RecordingObserver()
+    with (
+        labseq.Session.open(
+            tmp_path / "seen.yaml", overrides=overrides, observer=observer, output=tmp_path
+        ) as session,
+        suppress(AlarmError),
+    ):
+        session.run()
+    warnings = [values["text"] for name, values in observer.events if name == "warning"]
+    assert [text.split("'")[1] for text in warnings if "alarm" in text] == [alarm]
