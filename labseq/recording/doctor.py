@@ -345,7 +345,7 @@ class _Check:
         numbers, last = [*rows], [*rows.values()][-1]
         path = self.folder / last.file
         try:
-            n_bytes, sha256 = _size_and_hash(path)
+            n_bytes, sha256, is_marked = _size_and_hash(path)
         except FileNotFoundError:
             index.remove(numbers)
             remedy = "its line moved to quarantine; if you find the file, put it back and run this again"
@@ -355,13 +355,19 @@ class _Check:
             self._add(f"cannot be read: {error.strerror}", path, _CHECK_PERMISSIONS)
             return False
         good = [number for number, row in rows.items() if row.sha256 == sha256]
-        if not good:
+        if is_marked and (good or _is_locked(path)):
+            what, then = "another program has it open for writing", "left as it is: nothing has changed"
+            if not good:
+                what, then = f"{what} and has changed it", "left: close it there, then run this again"
+            self.findings.append(Finding(what, path, then, left=not good))
+        elif not good:
             what = "the checksum does not hold: a byte has changed since it was written"
             if n_bytes < last.bytes:
                 what = f"the shot's file is cut off: {n_bytes} of {last.bytes} bytes"
             remedy = f"{_TO_QUARANTINE}, with its line"
             if self._add(what, path, remedy, lambda: _move_away(what, path, self.folder)):
                 index.remove(numbers)
+        if not good:
             return False
         superfluous = [number for number in numbers if number != good[-1]]
         index.remove(superfluous, f"a second line for {path.name}")
@@ -380,7 +386,7 @@ class _Check:
             content = read_content(path)
             for _ in iter_frames(path):  # each must be readable
                 pass
-            n_bytes, sha256 = _size_and_hash(path)
+            n_bytes, sha256, _ = _size_and_hash(path)
             with damage_reported(path):
                 row = row_of_record(
                     content.record,
@@ -436,10 +442,33 @@ class _Check:
         return repair is not None
 
 
-def _size_and_hash(path: Path) -> tuple[int, str]:
-    """Size of a file, and its SHA-256."""
+_OPEN_FOR_WRITING: Final = b"\1\0\0\0"
+"""What HDF5 writes after byte 20 of a file while a program has it open for writing, in place of zeros."""
+
+
+def _size_and_hash(path: Path) -> tuple[int, str, bool]:
+    """Size of a shot's file, its SHA-256 without HDF5's mark, and whether a program has marked it as open."""
     with open_ordinary(path) as file:
-        return os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
+        head = file.read(24)
+        is_marked = head[:9] == b"\x89HDF\r\n\x1a\n\0" and head[20:] == _OPEN_FOR_WRITING
+        digest = hashlib.sha256(head[:20] + bytes(4) if is_marked else head)
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+        return os.fstat(file.fileno()).st_size, digest.hexdigest(), is_marked
+
+
+def _is_locked(path: Path) -> bool:
+    """Whether a program holds HDF5's lock on a file; one that died has left only its mark."""
+    try:
+        import fcntl
+    except ImportError:  # on Windows a file that is open cannot be moved anyway
+        return True
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            return True
+    return False
 
 
 def _is_name(row: IndexRow) -> bool:

@@ -9,8 +9,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -102,6 +103,27 @@ def test_a_whole_run_is_left_as_it_is(run_dir: Path) -> None:
     report = examine(run_dir.parents[1])
     assert (report.findings, report.n_runs, report.n_shots) == ([], 1, N_SHOTS + 1)
     assert {path: path.stat().st_mtime_ns for path in run_dir.rglob("*")} == before
+
+
+@pytest.mark.parametrize("mode", ["r+", "a"])
+def test_what_a_viewer_has_open_for_writing_stays(run_dir: Path, mode: Literal["r+", "a"]) -> None:
+    files = sorted((run_dir / "shots").glob("*.h5"))
+    before, index = [file.read_bytes() for file in files], (run_dir / "index.jsonl").read_bytes()
+    with ExitStack() as stack:
+        viewed = [stack.enter_context(h5py.File(file, mode)) for file in files]
+        report = examine(run_dir)
+        assert [(finding.where, finding.left) for finding in report.findings] == [
+            (file, False) for file in files
+        ]
+        viewed[0]["entry"].attrs["comment"] = "seen"
+        viewed[0].flush()
+        (changed, *others) = examine(run_dir).findings
+        assert (changed.where, changed.left, len(others)) == (files[0], True, len(files) - 1)
+        assert "close it" in changed.done
+    assert (run_dir / "index.jsonl").read_bytes() == index
+    assert [file.read_bytes() for file in files[1:]] == before[1:]
+    (quarantined,) = examine(run_dir).findings  # what was changed and is closed
+    assert quarantined.where == files[0]
 
 
 def test_a_file_that_is_put_back_counts_again(run_dir: Path) -> None:
