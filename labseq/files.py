@@ -169,7 +169,7 @@ def is_there(path: Path) -> bool:
     return True
 
 
-def lines_in(path: Path, start: int = 0) -> Generator[bytes]:
+def lines_in(path: Path, start: int = 0, longest: int = MAX_LINE) -> Generator[bytes]:
     r"""The lines of a file from a byte on, with their ends; the last one may lack its "\n".
 
     Raises:
@@ -178,9 +178,9 @@ def lines_in(path: Path, start: int = 0) -> Generator[bytes]:
     try:
         with open_ordinary(path) as file:
             file.seek(start)
-            while line := file.readline(MAX_LINE + 1):
-                if len(line) > MAX_LINE:
-                    fault = f"has a line longer than {MAX_LINE >> 20} MiB"
+            while line := file.readline(longest + 1):
+                if len(line) > longest:
+                    fault = f"has a line longer than {longest >> 20} MiB"
                     raise RecordingError(path, fault, "restore it from a backup")
                 yield line
     except OSError as error:
@@ -258,10 +258,12 @@ class NewLines:
 
     Args:
         path: The file; it need not exist yet.
+        longest: Longest line, in bytes.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, longest: int = MAX_LINE) -> None:
         self._path = path
+        self._longest = longest
         self._at, self._inode = 0, 0
 
     def placed(self) -> Generator[tuple[int, dict[str, Any] | None]]:
@@ -273,7 +275,7 @@ class NewLines:
         if not self._path.exists():
             return
         self._inode = self._path.stat().st_ino
-        for line in lines_in(self._path, self._at):
+        for line in lines_in(self._path, self._at, self._longest):
             if line.endswith(b"\n"):  # else it is still being written
                 start, self._at = self._at, self._at + len(line)
                 yield start, parse_object(line)

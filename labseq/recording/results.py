@@ -2,24 +2,41 @@
 
 A line with "shot" is the result of a shot; of several lines for the same shot the last one counts. Any
 other line describes the analysis of the results that follow it: plugin, version, settings. If "again" in
-it is true, the lines before it no longer count.
+it is true, the lines before it no longer count. Large arrays are in an HDF5 file for each shot, in a folder
+beside the lines, which name the dataset.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any, Final, cast
 
+import numpy as np
+from numpy.typing import NDArray
+
 from labseq.errors import RecordingError
-from labseq.files import LineLog, NewLines, explained
-from labseq.messages import format_plugin_error
+from labseq.files import LineLog, NewLines, explained, write_file
+from labseq.messages import clean, format_plugin_error
+from labseq.plain import dumps, plain_text
 from labseq.recording import folders
+from labseq.units import size_text
 
 SHOT: Final = "shot"
 ERROR: Final = "error"
+ARRAY: Final = "array"
+"""Key of a line in place of a large array, with the name of the dataset."""
 AGAIN: Final = "again"
 _SUFFIX: Final = ".jsonl"
+MAX_IN_LINE: Final = 1000
+"""Numbers that an array in a line may have; a larger one is in a file of its own."""
+MAX_TEXT: Final = 1_000_000
+"""Size of a line, in bytes."""
+LONGEST_LINE: Final = 1 << 28
+"""Longest line that is read over, in bytes: earlier versions of labseq wrote large arrays as lines."""
 
 
 def results_file(run_dir: Path, name: str) -> Path:
@@ -46,11 +63,14 @@ class ResultsLog:
         self._log.append(about, sync=True)
 
     @staticmethod
-    def checked(result: object) -> Mapping[str, Any]:
+    def checked(result: object) -> dict[str, Any]:
         """Check that a result can be written.
 
+        Returns:
+            The result, of which only arrays are not plain.
+
         Raises:
-            TypeError: It is not a mapping of names to values.
+            TypeError: It is not a mapping of names to values, or a value can be neither JSON nor an array.
         """
         if not isinstance(result, Mapping):
             raise TypeError(f"the result is {type(result).__name__}; expected a mapping of names to values")
@@ -60,15 +80,115 @@ class ResultsLog:
                 raise TypeError(
                     f"the result has the name {name!r}; expected a text other than '{SHOT}' and '{ERROR}'"
                 )
-        return values
+        row = {name: _checked(value, f"the result '{clean(name)}'") for name, value in values.items()}
+        n_bytes = len(dumps({name: value for name, value in row.items() if not _is_large(value)}))
+        if n_bytes > MAX_TEXT:
+            what = f"the result is {size_text(n_bytes)} of text, and at most {size_text(MAX_TEXT)} are kept"
+            raise TypeError(f"{what}; return arrays of numpy, each under a name of its own")
+        return row
 
     def write(self, shot: int, result: Mapping[str, Any]) -> None:
-        """Write the result of a shot."""
-        self._log.append({SHOT: shot, **result}, sync=True)
+        """Write the result of a shot; its large arrays first.
+
+        Raises:
+            RecordingError: It cannot be written.
+        """
+        large = {name: value for name, value in result.items() if _is_large(value)}
+        names = {name: str(number) for number, name in enumerate(large)}
+        if large:
+            path = _arrays_file(self.path, shot)
+            with explained(path):
+                path.parent.mkdir(exist_ok=True)
+            write_file(path, _encoded({names[name]: (name, array) for name, array in large.items()}))
+        row = {
+            name: {ARRAY: names[name], "shape": value.shape, "dtype": value.dtype.name}
+            if name in large
+            else value
+            for name, value in result.items()
+        }
+        self._log.append({SHOT: shot, **row}, sync=True)
 
     def fail(self, shot: int, error: BaseException) -> None:
         """Write why a shot has no result."""
         self._log.append({SHOT: shot, ERROR: format_plugin_error(error)}, sync=True)
+
+
+def _is_large(value: object) -> bool:
+    return isinstance(value, np.ndarray) and value.size > MAX_IN_LINE
+
+
+def _checked(value: Any, what: str) -> Any:
+    """A value as it can be written: plain, or an array of numbers.
+
+    Raises:
+        TypeError: It is something else; names its place in the result.
+    """
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf":
+        return value
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, date):
+        return value.isoformat()
+    if isinstance(value, Mapping):
+        items = cast("Mapping[Any, Any]", value).items()
+        return {str(key): _checked(item, f"{what}, '{clean(str(key))}'") for key, item in items}
+    if isinstance(value, list | tuple):
+        items = enumerate(cast("Sequence[Any]", value))
+        return [_checked(item, f"{what}, number {number}") for number, item in items]
+    kind = f"array of {value.dtype.name}" if isinstance(value, np.ndarray) else type(value).__name__
+    expected = "expected numbers, texts, arrays of numbers, and lists and mappings of them"
+    if "complex" in kind:
+        expected = "expected real numbers: return real and imaginary part under two names"
+    raise TypeError(f"{what} is of the type {kind}; {expected}")
+
+
+def _arrays_file(path: Path, shot: int) -> Path:
+    """The file with the large arrays of a shot's result."""
+    return path.with_suffix("") / f"shot_{shot:06d}.h5"
+
+
+def _encoded(arrays: Mapping[str, tuple[str, NDArray[Any]]]) -> memoryview:
+    """An HDF5 file of arrays: dataset -> its name in the result, and the array."""
+    import h5py
+
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        for dataset, (name, array) in arrays.items():
+            file.create_dataset(dataset, data=array).attrs["name"] = plain_text(name)
+    return buffer.getbuffer()
+
+
+@dataclass(frozen=True, slots=True)
+class StoredArray:
+    """A large array of a result, which ``numpy.asarray`` reads from its file.
+
+    Attributes:
+        path: The HDF5 file.
+        dataset: Its dataset there.
+        shape: Its shape.
+        dtype: Its type.
+    """
+
+    path: Path
+    dataset: str
+    shape: tuple[int, ...]
+    dtype: str
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """Read it.
+
+        Raises:
+            RecordingError: Its file is missing or damaged.
+        """
+        import h5py
+
+        try:
+            with h5py.File(self.path, "r", locking=False) as file:
+                array: NDArray[Any] = np.asarray(file[self.dataset])
+        except (OSError, KeyError) as error:
+            hint = "'labseq analyse --again' makes the results once more"
+            raise RecordingError(self.path, f"has no readable array '{self.dataset}'", hint) from error
+        return array if dtype is None else array.astype(dtype)
 
 
 class Results:
@@ -80,7 +200,7 @@ class Results:
     """
 
     def __init__(self, path: Path) -> None:
-        self._lines = NewLines(path)
+        self._lines = NewLines(path, LONGEST_LINE)
         self.rows: dict[int, dict[str, Any]] = {}
         self.about: dict[str, Any] = {}
 
@@ -130,7 +250,17 @@ def rows_of(run_dir: Path, name: str) -> list[dict[str, Any]]:
         others = f"only of {', '.join(names)}" if names else "nor of any other"
         hint = f"make them with 'labseq analyse {run_dir} --use {name}'"
         raise RecordingError(path, f"there are no results of the analysis '{name}', {others}", hint)
-    return read_results(path)[0]
+    rows = read_results(path)[0]
+    return [{name: _stored(path, row[SHOT], value) for name, value in row.items()} for row in rows]
+
+
+def _stored(path: Path, shot: int, value: Any) -> Any:
+    """A value of a row; for an array in a file of its own what reads it."""
+    match value:
+        case {"array": str(dataset), "shape": [*shape], "dtype": str(dtype)}:
+            return StoredArray(_arrays_file(path, shot), dataset, tuple(shape), dtype)
+        case _:
+            return value
 
 
 def result_columns(run_dir: Path) -> dict[str, dict[int, Any]]:

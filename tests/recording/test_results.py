@@ -10,7 +10,7 @@ import pytest
 from labseq.data import open_run
 from labseq.errors import RecordingError
 from labseq.recording import RunWriter
-from labseq.recording.results import ResultsLog, read_results, results_file, shots_with_result
+from labseq.recording.results import ResultsLog, read_results, results_file, rows_of, shots_with_result
 
 from .records import make_run
 
@@ -62,6 +62,44 @@ def test_a_torn_last_line_is_no_result_and_takes_none_with_it(path):
 def test_what_is_no_result_is_refused(result):
     with pytest.raises(TypeError, match="the result"):
         ResultsLog.checked(result)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (1 + 2j, "'x' is of the type complex; .*real and imaginary part under two names"),
+        (np.zeros(3, np.complex128), "'x' is of the type array of complex128; .*two names"),
+        ({"a": [1, {"b": object()}]}, "'x', 'a', number 1, 'b' is of the type object; expected numbers"),
+        (np.zeros(3, [("a", "f8")]), "array of void"),
+        ([0.5] * 300_000, r"the result is 1\.5 MB of text, .*return arrays of numpy"),
+    ],
+)
+def test_a_value_of_the_wrong_type_is_refused_where_it_is(value, words):
+    with pytest.raises(TypeError, match=words):
+        ResultsLog.checked({"good": 1, "x": value})
+
+
+def test_large_arrays_are_in_files_of_their_own(path):
+    image, log = np.arange(2e6, dtype=np.float32).reshape(1000, 2000), ResultsLog(path, ABOUT)
+    log.write(0, ResultsLog.checked({"light": np.float64(3), "an/image": image, "map": np.eye(3)}))
+    assert path.stat().st_size < 1000
+    (row,) = rows_of(path.parent.parent, "mine")
+    assert (row["light"], row["map"]) == (3.0, np.eye(3).tolist())
+    assert (row["an/image"].shape, row["an/image"].dtype) == ((1000, 2000), "float32")
+    assert np.array_equal(np.asarray(row["an/image"]), image)
+    (path.parent / "mine" / "shot_000000.h5").unlink()
+    with pytest.raises(RecordingError, match="--again"):
+        np.asarray(row["an/image"])
+
+
+def test_a_line_that_an_earlier_labseq_wrote_much_too_long_hides_no_other(path):
+    log = ResultsLog(path, ABOUT)
+    log.write(0, {"mean": 1})
+    with path.open("ab") as file:
+        file.write(b'{"shot": 1, "image": [' + b"[0.123456789]," * 1_300_000 + b"[0]]}\n")
+    ResultsLog(path, ABOUT).write(2, {"mean": 2})
+    assert path.stat().st_size > 17 << 20
+    assert [row["shot"] for row in read_results(path)[0]] == [0, 2]
 
 
 def test_a_run_finds_its_results(tmp_path):
