@@ -73,7 +73,11 @@ def test_readings_have_the_units_that_their_devices_name(tmp_path: Path) -> None
     devices = {"laser": {"units": {"power": "W", "mode": 3}}, "odd": {"units": "W"}, "older": None}
     shot = make_shot(readings={"laser.power": 0.1, "laser.current_a": 1.0, "odd.x": 2.0})
     units = write(tmp_path, shot, devices=devices).to_dataframe().attrs["units"]
-    assert [units[f"reading.{name}"] for name in ("laser.power", "laser.current_a", "odd.x")] == ["W", "A", ""]
+    assert [units[f"reading.{name}"] for name in ("laser.power", "laser.current_a", "odd.x")] == [
+        "W",
+        "A",
+        "",
+    ]
 
 
 @pytest.mark.needs("pyarrow")

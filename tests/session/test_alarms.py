@@ -16,7 +16,7 @@ import labseq
 from labseq.config.profile import AlarmSettings
 from labseq.errors import AlarmError
 from labseq.model import Frame, ImageRecord, ShotRecord
-from labseq.sequencer.clock import ClockJumps
+from labseq.sequencer.clock import CLOCK_SET, ClockJumps
 from labseq.session.alarms import Alarms
 from labseq.testing.fakes import RecordingObserver
 
@@ -219,9 +219,11 @@ class Broken:
         def count(alarms: Alarms, shot: ShotRecord) -> None:
             look(alarms, shot)
             self.n += 1
-            if self.n == 10 and alarm == "clock":
-                patch.setattr(alarms, "_difference_s", -3600.0)
 
+        def jumps(_: ClockJumps) -> dict[str, float]:
+            return {CLOCK_SET: 3600.0} if self.n == 10 and alarm == "clock" else {}
+
+        patch.setattr(ClockJumps, "since_last", jumps)
         patch.setattr(VirtualCamera, "read", read_frame)
         patch.setattr(VirtualSimulation, "load", load_atoms)
         patch.setattr(Alarms, "look", count)
