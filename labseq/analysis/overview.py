@@ -134,7 +134,7 @@ def overview(run: Run) -> RunPicture:
     # a single panel is in the row of its quantity
     rows += [panels for name in names if len(panels := summary.scan_row(name)) > 1]
     rows.append(_present(*survival_panels(run, survival), stages_panel(run, timing)))
-    return _picture(run, f"run {clean(run.name)}", rows)
+    return _picture(run, f"run {visible(run.name)}", rows)
 
 
 def picture_of(run: Run, what: str) -> RunPicture:
@@ -594,7 +594,8 @@ def note_of(run: Run) -> str:
     target = run.target
     atoms = "no target" if target.is_none else f"{clean(target.name)}, {target.n_atoms} atoms"
     kind = "simulated" if run.simulated else "measured"
-    return f"{clean(run.path.parent.name)}/{clean(run.path.name)}{ended}: {atoms}, seed {run.seed}, {kind}"
+    name = visible(f"{run.path.parent.name}/{run.path.name}")
+    return f"{name}{ended}: {atoms}, seed {run.seed}, {kind}"
 
 
 def cannot_draw(run: Run, problem: str, expected: str) -> ConfigError:
