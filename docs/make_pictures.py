@@ -83,6 +83,11 @@ PICTURES: Final = {
         ("labseq run window.yaml --seed 1", "labseq plot --what scan -o window.png"),
         "window.png",
     ),
+    "pulses/ramsey.png": Picture(
+        "how-to/pulses.md",
+        ("labseq run ramsey --seed 2", "labseq plot --what scan -o ramsey.png"),
+        "ramsey.png",
+    ),
     "plot/overview.png": Picture("how-to/plot.md", (_SCAN, "labseq plot"), "*.png"),
     "plot/cycle.png": Picture("how-to/plot.md", (_SCAN, "labseq plot --shot 3 --cycle 1"), "*.png"),
     **{

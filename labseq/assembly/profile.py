@@ -143,13 +143,14 @@ class ResolvedProfile:
 
 def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, problems: ProblemCollector) -> None:
     """Find lines that are on during unknown steps."""
-    if spec.lines is None:
-        return
+    channels = {} if spec.lines is None else spec.lines.channels
+    if not any(channel.on for channel in channels.values()):
+        return  # without loading the modules of all steps
     registry = host.registry
     entries = {name: registry.find("step", name) for name in registry.names("step")}
     steps = [name for name, entry in entries.items() if entry and getattr(entry.factory, "takes_time", True)]
     known = [IDLE, *steps]
-    for name, channel in spec.lines.channels.items():
+    for name, channel in channels.items():
         for place, kind in enumerate(channel.on):
             if kind not in known:
                 loc = ("lines", "channels", name, "on", place)

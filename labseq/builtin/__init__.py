@@ -22,6 +22,7 @@ def labseq_register(registry: Registry) -> None:
     registry.step("rearrange", f"{rearrange}:RearrangeStep", f"{rearrange}:RearrangeSettings")
     registry.step("ramp", f"{steps}:RampStep", f"{steps}:RampSettings")
     registry.step("release", f"{steps}:ReleaseStep", f"{steps}:ReleaseSettings")
+    registry.step("pulse", "labseq.builtin.pulses:PulseStep", "labseq.builtin.pulses:PulseSettings")
     registry.step("probe", f"{probes}:ProbeStep", f"{probes}:ProbeSettings")
     registry.step("check_sites", f"{probes}:CheckSitesStep", f"{probes}:CheckSitesSettings")
     registry.step("check_overlay", f"{probes}:CheckOverlayStep", f"{probes}:CheckOverlaySettings")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from labseq.errors import RecordingError
 from labseq.files import open_ordinary
 from labseq.model import CycleRecord, ImageRecord, Plan, ShotRecord, StageTiming, StepTiming, TargetPattern
-from labseq.model.records import ShotStatus
+from labseq.model.records import LineEdge, ShotStatus
 from labseq.recording.index import IndexRow
 
 if TYPE_CHECKING:
@@ -151,6 +151,11 @@ class Shot:
     def steps(self) -> tuple[StepTiming, ...]:
         """Planned and achieved durations of the steps."""
         return tuple(self._content.record.steps)
+
+    @property
+    def edges(self) -> tuple[LineEdge, ...]:
+        """The changes of the lines, as the timing box played them; empty without a timing box."""
+        return tuple(self._content.record.edges)
 
     @property
     def timing(self) -> tuple[StageTiming, ...]:

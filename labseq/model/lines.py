@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,15 @@ from labseq.settings import IN_SI, Duration, OwnName, Text, setting_error
 
 IDLE: Final = "idle"
 """The kind of the time between steps, and before and after a shot."""
+
+
+Span: TypeAlias = tuple[float, float]
+"""From one time to another, in seconds."""
+
+Pulses: TypeAlias = Mapping[str, Sequence[Span]]
+"""Line -> when it is on, from the beginning of a step."""
+
+NO_PULSES: Final[Pulses] = {}
 
 
 _TRIGGERED: Final = {"camera": "image", "mobile_tweezers": "rearrange"}
@@ -32,7 +41,7 @@ class LineSpec:
         tuple[Text, ...],
         Field(
             description="kinds of step during which it is on: `load`, `image`, `rearrange`, `ramp`, "
-            "`release`, `wait`; `idle`: between steps, and before and after a shot"
+            "`release`, `pulse`, `wait`; `idle`: between steps, and before and after a shot"
         ),
     ] = ()
     lead_s: Annotated[Duration, Field(description="how long before such a step it is turned on")] = 0.0
@@ -164,6 +173,18 @@ class LineProgram:
             elif is_on and end > start:
                 spans.append((start, end))
         return spans
+
+    def changes(self) -> list[tuple[str, bool, float]]:
+        """Line, whether it is on from then on, and time of each change, line by line.
+
+        The lines are idle before the program, as at its end.
+        """
+        changed = self.on != np.vstack([self.on[-1:], self.on[:-1]])
+        columns, edges = np.nonzero(changed.T)
+        return [
+            (self.lines[column], bool(self.on[edge, column]), float(self.t_s[edge]))
+            for column, edge in zip(columns.tolist(), edges.tolist(), strict=True)
+        ]
 
     def rising(self, line: str) -> list[float]:
         """Times at which a line switches on, in seconds from the start of the program; 0 if it starts on."""

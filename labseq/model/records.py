@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from labseq.model.lines import Pulses, Span
+
 if TYPE_CHECKING:
     from labseq.model.camera import Frame
     from labseq.model.grid import Occupancy, TargetPattern
@@ -114,6 +116,25 @@ class StepTiming:
     host_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class LineEdge:
+    """A change of one line, as the timing box played it.
+
+    Attributes:
+        step: Index of the step in the shot.
+        line: Name of the line.
+        on: Whether it is on from then on.
+        t_s: When, from the start of the program of its step: a multiple of the box's resolution.
+        t_start_s: Start of this program on the session's clock, from the start of the shot.
+    """
+
+    step: int
+    line: str
+    on: bool
+    t_s: float
+    t_start_s: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageRecord:
     """One image and what was seen on it.
@@ -216,6 +237,7 @@ class ShotRecord:
         cycles: In the order they were made.
         timing: In the order the stages ended.
         steps: Planned and achieved durations of the steps that have ended.
+        edges: In the order they were played; within a program, line by line.
         seen_defect_free_cycle: Index of the first cycle whose image met the target; -1 if none.
         success: Whether the last ``image`` step met the target.
         filling_fraction: Filling of the target on the last ``image`` step; nan
@@ -242,6 +264,7 @@ class ShotRecord:
     cycles: list[CycleRecord] = field(default_factory=list[CycleRecord])
     timing: list[StageTiming] = field(default_factory=list[StageTiming])
     steps: list[StepTiming] = field(default_factory=list[StepTiming])
+    edges: list[LineEdge] = field(default_factory=list[LineEdge])
     seen_defect_free_cycle: int = -1
     success: bool = False
     filling_fraction: float = float("nan")
@@ -346,6 +369,7 @@ class TimelineEntry:
         kind: Kind of step that the profile's lines know it by, "image"; "" for one that they do not go with.
         timed_by: What times it.
         latency_s: How long after the end of the part before it it begins at the outputs, in seconds.
+        pulses: When it turns lines on itself.
     """
 
     label: str
@@ -356,3 +380,4 @@ class TimelineEntry:
     kind: str = ""
     timed_by: TimedBy = COMPUTER
     latency_s: float = 0.0
+    pulses: Pulses = field(default_factory=dict[str, Sequence[Span]])

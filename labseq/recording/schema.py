@@ -13,6 +13,7 @@ The tree of a shot file, with n images, a grid of (row, col) sites and frames of
       rearrangement             tables of moves, batches and cycles, and of paths where tones have some;
                                 predicted (cycle, row, col)
       steps                     table of the steps: planned and achieved durations
+      edges                     table of the changes of the lines, if there are any
       timing                    table of the stages
       atom_events               tables of the events of the atoms in a simulation
 
@@ -38,7 +39,7 @@ from labseq.model import CycleRecord, Plan, PlanReport
 from labseq.plain import plain_text
 
 FORMAT: Final = "labseq-shot"
-FORMAT_VERSION: Final = "4.1"
+FORMAT_VERSION: Final = "4.2"
 """major.minor: a newer minor version only adds values; another major version cannot be read."""
 
 RUN_FORMAT: Final = "labseq-run"
@@ -461,7 +462,23 @@ STEPS: Final = Table(
 )
 """The table of a :class:`StepTiming` for each step."""
 
-TABLES: Final = (IMAGES, EXPOSURES, MOVES, BATCHES, PATHS, CYCLES, STEPS, TIMING)
+EDGES: Final = Table(
+    "edges",
+    "edge",
+    "the changes of the lines, as the timing box played them; left out if there are none",
+    _fields(
+        """
+        step       i4    index of the step in the shot, from 0
+        line       text  name of the line
+        on         ?     whether it is on from then on
+        t_s        f8    when, from the start of the program of its step: a multiple of the box's resolution
+        t_start_s  f8    start of this program on the session's clock, from the start of the shot
+        """
+    ),
+)
+"""The table of a :class:`LineEdge` for each edge."""
+
+TABLES: Final = (IMAGES, EXPOSURES, MOVES, BATCHES, PATHS, CYCLES, STEPS, EDGES, TIMING)
 
 
 def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> list[CycleRecord]:

@@ -18,6 +18,7 @@ import labseq
 from labseq.errors import RecordingError
 from labseq.messages import error_text, format_error
 from labseq.model import Frame, ImageRecord, RunRecord, ShotRecord, StageTiming, StepTiming, TargetPattern
+from labseq.model.records import LineEdge
 from labseq.recording import schema
 from labseq.recording.hdf5 import (
     check_contents,
@@ -89,6 +90,8 @@ class ShotEncoder:
         _write_detection(entry["detection"], shot, self._run.target.shape)
         _write_cycles(entry.create_group("rearrangement"), shot, self._run.target.shape)
         write_table(entry, schema.STEPS, schema.STEPS.rows(shot.steps))
+        if shot.edges:
+            write_table(entry, schema.EDGES, schema.EDGES.rows(shot.edges))
         write_table(entry, schema.TIMING, schema.TIMING.rows(shot.timing))
         if shot.atom_events:
             events, names = entry.create_group("atom_events"), list[str]()
@@ -329,6 +332,7 @@ def _record(entry: Any) -> ShotRecord:
     events = entry.get("atom_events", {})
     timing = schema.TIMING.arguments(StageTiming, entry["timing"][()])
     steps = schema.STEPS.arguments(StepTiming, entry["steps"][()]) if "steps" in entry else []
+    edges = schema.EDGES.arguments(LineEdge, entry["edges"][()]) if "edges" in entry else []
     return ShotRecord(
         **{name: value for name, value in values.items() if name in names},
         parameters=read_values(entry["parameters"]),
@@ -340,6 +344,7 @@ def _record(entry: Any) -> ShotRecord:
         ),
         timing=[StageTiming(**stage) for stage in timing],
         steps=[StepTiming(**step) for step in steps],
+        edges=[LineEdge(**edge) for edge in edges],
         atom_events={name: table[()] for name, table in events.items()},
     )
 

@@ -26,7 +26,7 @@ from labseq.model import (
     TimelineEntry,
     TweezersFacts,
 )
-from labseq.model.lines import IDLE, lines_of, margin_s
+from labseq.model.lines import IDLE, NO_PULSES, Pulses, lines_of, margin_s
 
 if TYPE_CHECKING:
     from labseq.errors import Problem
@@ -270,7 +270,11 @@ class Shot(Protocol):
         ...
 
     def lines_on(
-        self, kind: str, duration_s: float, start: Callable[[], object] | None = None
+        self,
+        kind: str,
+        duration_s: float,
+        start: Callable[[], object] | None = None,
+        pulses: Pulses = NO_PULSES,
     ) -> AbstractContextManager[None]:
         """Context manager for the work of a step: its lines switch on before it and off after it.
 
@@ -279,6 +283,7 @@ class Shot(Protocol):
             duration_s: Duration of the step, in seconds.
             start: Starts the step's device when the step begins, or arms it before the lines are fired if
                 one of them triggers it.
+            pulses: When the step itself turns lines on, from its beginning: line -> (start, end), in seconds.
         """
         ...
 
@@ -439,7 +444,7 @@ class Step(ABC):
 
         Returns:
             Setting -> what is wrong with it, as text or, with what was expected and a hint, as a ``Problem``
-            without a place; empty if nothing is.
+            without a place; empty if nothing is. A setting within others has dots: "parts.dark.duration".
         """
         return {}
 

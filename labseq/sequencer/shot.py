@@ -26,14 +26,16 @@ from labseq.model import (
     CycleRecord,
     Frame,
     ImageRecord,
+    LineProgram,
     Occupancy,
     ShotRecord,
     StageTiming,
     StepTiming,
     TimelineEntry,
 )
+from labseq.model.lines import NO_PULSES, Pulses
 from labseq.model.policies import NO_POLICY, StepPolicy
-from labseq.model.records import OVERSHOOT_S, STEP
+from labseq.model.records import OVERSHOOT_S, STEP, LineEdge
 from labseq.realtime import raise_priority, restore_priority
 from labseq.roles import Device, Hardware, ReportsSignals, RunObserver, StepContext, overrides
 from labseq.sequencer.images import CameraSeries, take_frame
@@ -361,7 +363,11 @@ class RunningShot:
 
     @contextmanager
     def lines_on(
-        self, kind: str, duration_s: float, start: Callable[[], object] | None = None
+        self,
+        kind: str,
+        duration_s: float,
+        start: Callable[[], object] | None = None,
+        pulses: Pulses = NO_PULSES,
     ) -> Generator[None]:
         """Fire the lines of a kind of step around it; see ``labseq.roles.Shot``."""
         lines, timeout_s, specs = self.lab.lines, self.call_timeout_s, self.lab.line_specs
@@ -372,7 +378,7 @@ class RunningShot:
             self._begin_moves(start)
             yield
             return
-        program = line_program(specs, kind, duration_s)
+        program = line_program(specs, kind, duration_s, pulses)
         self.call("lines", timeout_s, lines.compile, program)
         self.call("lines", timeout_s, lines.arm)
         self._fired_s = self.clock.now()
@@ -383,11 +389,20 @@ class RunningShot:
         if start is not None and not is_triggered:
             start()
         self._begin_moves(start)
+        self._record_edges(program, fired_s, lines.lines_facts.resolution_s)
         yield
         if is_triggered:
             self._check_end(program.begin_s + duration_s)
         left_s = max(0.0, program.duration_s - (self.clock.now() - fired_s)) + timeout_s
         self.call("lines", left_s + DRIVER_MARGIN_S, lines.wait, left_s)
+
+    def _record_edges(self, program: LineProgram, fired_s: float, tick_s: float) -> None:
+        """Record what a program changes, at the times that the box makes of its edges."""
+        start_s = fired_s - self.start_s
+        self.record.edges += [
+            LineEdge(self.step, line, is_on, round(t_s / tick_s) * tick_s if tick_s else t_s, start_s)
+            for line, is_on, t_s in program.changes()
+        ]
 
     def _begin_moves(self, start: Callable[[], object] | None) -> None:
         """Record how long after the frame the light of the mobile tweezers came, and report what was kept."""

@@ -24,12 +24,13 @@ from labseq.assembly.wiring import unsuitable_exposures
 from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, ProblemCollector, one_of
 from labseq.guard import Guard
 from labseq.messages import visible
-from labseq.model import COMPUTER, Frame, Plan, TimelineEntry
+from labseq.model import COMPUTER, Frame, LineSpec, Plan, TimelineEntry
+from labseq.model.lines import NO_PULSES, LineProgram, Pulses
 from labseq.motion import tone_program
 from labseq.roles import Detector, Step, find_leader
 from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab
-from labseq.sequencer.lines import line_program, own_duration_s, spans_on, trigger_line
+from labseq.sequencer.lines import line_program, own_duration_s, trigger_line
 from labseq.sequencer.run import plan_timeline
 from labseq.session.prepared import PreparedRun
 from labseq.session.rehearsal import Rehearsal, quantile, rehearse, windows_of
@@ -129,7 +130,8 @@ class _PointCheck:
         """Have every step check its settings against the devices."""
         for spec, (name, step) in zip(self.shot, self.point.steps, strict=True):
             for setting, problem in _wrong_settings(self._guard, self.lab, name, step).items():
-                loc = (*spec.loc, setting) if setting else spec.loc
+                within = (int(key) if key.isdecimal() else key for key in setting.split(".") if setting)
+                loc = (*spec.loc, *within)
                 self._add(loc, problem.what, problem.expected, problem.hint)
 
     @cached_property
@@ -163,7 +165,7 @@ class _PointCheck:
                     if bar.exposure_s:
                         self.lab.step_context.camera.check_exposure(bar.exposure_s)
                     if bar.kind and bar.kind != "rearrange":  # its length follows from the plan
-                        self._ask_lines(bar.kind, own_duration_s(self.lab.line_specs, bar))
+                        self._ask_lines(bar.kind, own_duration_s(self.lab.line_specs, bar), bar.pulses)
                 except LabseqError as error:
                     self._add((*spec.loc, "exposure" if bar.exposure_s else "duration"), str(error))
         if self.longest_exposure_s:
@@ -199,11 +201,21 @@ class _PointCheck:
             add = self._add_to_profile if loc[0] == "camera" else self._add
             add(loc, problem.what, problem.expected, problem.hint)
 
-    def _ask_lines(self, kind: str, duration_s: float) -> None:
+    def _ask_lines(self, kind: str, duration_s: float, pulses: Pulses = NO_PULSES) -> None:
         lab = self.lab
         if lab.lines is not None:
-            program = line_program(lab.line_specs, kind, duration_s)
+            program = line_program(lab.line_specs, kind, duration_s, pulses)
             self._guard.call("lines", lab.timeouts.call_s, lab.lines.check_program, program)
+            self._check_exclusive(program)
+
+    def _check_exclusive(self, program: LineProgram) -> None:
+        """Refuse pulses that turn lines on together which the profile declares mutually exclusive."""
+        lines = self.point.hardware.profile.lines
+        for pair in () if lines is None else lines.mutually_exclusive:
+            first, second = (program.on[:, program.lines.index(name)] for name in pair)
+            if (first & second).any():
+                what = f"'{pair[0]}' and '{pair[1]}' are on together, and the profile declares them"
+                raise ConfigError(f"{what} mutually exclusive")
 
     def _ask_timeouts(self) -> None:
         """A timeout that is written in the profile must be longer than the exposures."""
@@ -305,7 +317,7 @@ class CheckReport:
         rehearsal: The planner's results for random loadings; None without a rearrangement.
         shot_bytes: Size of a shot on disk at most; None if the camera does not report its frame shape.
         free_bytes: Free space on the disk of the data folder.
-        lines: Name of each line -> when it is on in the longest shot, as (start, end) in seconds.
+        line_specs: The lines of the timing box.
         idle_outputs: Name of each device that puts out something when nothing plays -> what.
     """
 
@@ -317,13 +329,20 @@ class CheckReport:
     rehearsal: Rehearsal | None
     shot_bytes: int | None
     free_bytes: int
-    lines: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict[str, Any])
+    line_specs: Sequence[LineSpec] = ()
     idle_outputs: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @property
     def bars(self) -> list[TimelineEntry]:
         """The bars of all steps."""
         return [bar for _, bars in self.timeline for bar in bars]
+
+    @property
+    def lines(self) -> Mapping[str, Sequence[tuple[float, float]]]:
+        """Name of each line -> when it is on in the longest shot, as (start, end) in seconds."""
+        from labseq.sequencer.line_spans import spans_on
+
+        return spans_on(self.line_specs, self.bars)
 
     @property
     def longest_shot_s(self) -> float:
@@ -391,7 +410,7 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         next(iter(rehearsals.values()), None),
         shot_bytes,
         free_bytes,
-        spans_on(first.lab.line_specs, bars),
+        first.lab.line_specs,
         {name: text for name, device in first.lab.hardware() if (text := device.idle_output)},
     )
 

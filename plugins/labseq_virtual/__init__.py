@@ -18,5 +18,7 @@ def labseq_register(registry: Registry) -> None:
         (registry.lines, "devices:VirtualLines", "LinesSettings"),
     ):
         kind("virtual", f"{module}.{factory}", f"{settings}:{model}", virtual_time=True)
-    spot_meter = f"{module}.devices:VirtualSpotMeter"
+    synthesizer = f"{module}.devices:VirtualSynthesizer"
+    registry.device("virtual_synthesizer", synthesizer, f"{settings}:SynthesizerSettings", virtual_time=True)
+    spot_meter = f"{module}.spot_meter:VirtualSpotMeter"
     registry.device("virtual_spot_meter", spot_meter, f"{settings}:SpotMeterSettings", virtual_time=True)

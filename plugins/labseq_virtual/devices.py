@@ -1,12 +1,9 @@
-"""Virtual lines, a virtual instrument, and a meter of the power of each static tweezer."""
+"""Virtual lines, an instrument of any kind, and a synthesizer that drives the atoms."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, Final
 
 from labseq.plugin import (
     Context,
@@ -21,7 +18,7 @@ from labseq.plugin import (
 )
 from labseq.plugin.lines import idle_program, off_program
 from labseq.plugin.messages import unknown_name
-from labseq_virtual.settings import DeviceSettings, LinesSettings, SpotMeterSettings
+from labseq_virtual.settings import DeviceSettings, LinesSettings, SynthesizerSettings
 from labseq_virtual.tweezers import VirtualDriver
 
 ROUNDING_S = 1e-9
@@ -212,46 +209,63 @@ class VirtualDevice(Device):
             raise DeviceError(self._name, "not open; call open() first")
 
 
-VALUE = "spot_powers"
+DIMENSIONS: Final[Mapping[str, str]] = {"frequency": "frequency", "phase": "angle", "shift": "angle"}
+"""Values of the synthesizer, and what they are."""
 
 
-class VirtualSpotMeter(VirtualDriver, Device):
-    """Measures the power of each static tweezer, with noise.
+class VirtualSynthesizer(VirtualDriver, Device):
+    """Has one command, ``set``, with any of ``frequency``, ``phase`` and ``shift``, which can be read."""
 
-    Its only value is ``spot_powers``, float64 (n_rows, n_cols), relative to the nominal power.
-    """
-
-    def __init__(self, settings: SpotMeterSettings, context: Context) -> None:
-        super().__init__(context, "spot_meter")
+    def __init__(self, settings: SynthesizerSettings, context: Context) -> None:
+        super().__init__(context, "synthesizer")
         self._settings = settings
+        self._values: dict[str, float] = {}
+
+    def open(self) -> None:
+        """Connect to the simulation, with the values of the settings."""
+        super().open()
+        self._tune({name: getattr(self._settings, name) for name in DIMENSIONS})
 
     def safe_state(self) -> None:
-        """Do nothing: the meter only measures."""
+        """Do nothing: a line switches what it drives."""
 
     def check_command(self, name: str, **arguments: Any) -> None:
-        """Refuse: the meter has no commands.
+        """Refuse an unknown command or argument, or one with another unit, with a ``DeviceError``."""
+        self._in_si(name, arguments)
 
-        Raises:
-            DeviceError: Always.
-        """
-        del arguments
-        raise DeviceError(self._name, f"unknown command '{name}'; it only measures: read '{VALUE}'")
-
-    command = check_command
-
-    def read(self, name: str) -> NDArray[np.float64]:
-        """Measure once.
-
-        Raises:
-            DeviceError: Not open, or an unknown value.
-        """
+    def command(self, name: str, **arguments: Any) -> None:
+        """Set values; raises ``DeviceError`` if it is not open, and as ``check_command``."""
         self._check_open()
-        if name != VALUE:
-            raise DeviceError(self._name, f"unknown value '{name}'; expected '{VALUE}'")
-        self._clock.sleep(20e-3)  # of a measurement (ours)
-        powers: NDArray[np.float64] = self._simulation.spot_powers()  # pyright: ignore[reportAttributeAccessIssue]
-        return powers * (1 + self._settings.noise * self._random.shot.standard_normal(powers.shape))
+        self._tune({**self._values, **self._in_si(name, arguments)})
+
+    def read(self, name: str) -> float:
+        """A value in SI; raises ``DeviceError`` if it is unknown or never was open."""
+        if name not in self._values:
+            raise unknown_name(self._name, "value", name, [*self._values])
+        return self._values[name]
 
     def describe(self) -> Mapping[str, Any]:
-        """Model and settings."""
-        return {"model": "virtual spot meter", **self._settings.model_dump(mode="json")}
+        """Model and values at the start."""
+        return {"model": "virtual synthesizer", **self._settings.model_dump(mode="json")}
+
+    def _tune(self, values: dict[str, float]) -> None:
+        self._values = values
+        self._simulation.tune(self._name, values)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _in_si(self, command: str, arguments: Mapping[str, Any]) -> dict[str, float]:
+        """The arguments as numbers; text has a unit."""
+        from labseq.plugin.units import parse_quantity  # only where a step sets values
+
+        if command != "set":
+            raise unknown_name(self._name, "command", command, ["set"])
+        values: dict[str, float] = {}
+        for name, value in arguments.items():
+            if name not in DIMENSIONS:
+                raise unknown_name(self._name, "argument", name, [*DIMENSIONS])
+            try:
+                values[name] = (
+                    parse_quantity(value, DIMENSIONS[name]) if isinstance(value, str) else float(value)
+                )
+            except ValueError as error:
+                raise DeviceError(self._name, f"{name}: {error}") from None
+        return values

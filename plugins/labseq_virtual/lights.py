@@ -13,17 +13,25 @@ from labseq_virtual.settings import LightSettings
 class Lights:
     """Which light is on, given the programs of the lines; without lines, all light is always on.
 
+    Args:
+        settings: The lines that each kind of light needs.
+        specs: The lines of the profile.
+        of_qubit: The lines that the settings of the two levels name.
+
     Raises:
         ConfigError: The settings name a line that the profile does not have.
     """
 
-    def __init__(self, settings: LightSettings, specs: Sequence[LineSpec]) -> None:
+    def __init__(
+        self, settings: LightSettings, specs: Sequence[LineSpec], of_qubit: Sequence[str] = ()
+    ) -> None:
         names = [spec.name for spec in specs]
         self._needs = {kind: getattr(settings, kind) for kind in LightSettings.model_fields}
-        for kind, needed in self._needs.items():
+        named = {f"lights.{kind}": needed for kind, needed in self._needs.items()} | {"qubit": of_qubit}
+        for key, needed in named.items():
             if names and (missing := [name for name in needed if name not in names]):
                 lines = ", ".join(f"'{name}'" for name in names)
-                raise ConfigError(f"`lights.{kind}` names a line '{missing[0]}'; the profile has {lines}")
+                raise ConfigError(f"`{key}` names a line '{missing[0]}'; the profile has {lines}")
         self._triggers = {spec.name: spec.triggers for spec in specs if spec.triggers}
         self._switches = [spec.name for spec in specs if spec.turns_off == "static_tweezers"]
         self._wires: dict[str, Callable[[float, float], object]] = {}

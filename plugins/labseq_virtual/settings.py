@@ -7,6 +7,7 @@ choice where the paper gives no value.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
@@ -303,6 +304,69 @@ class LightSettings(Settings):
     )
 
 
+TRANSITION_HZ = 6.83468261e9
+"""The clock transition of rubidium 87 (Steck, Rubidium 87 D Line Data: 6.834 682 610 9 GHz)."""
+
+
+class QubitSettings(Settings):
+    """The two levels of each atom: their drive, their decay, and the light that removes atoms."""
+
+    drive: str = Field(default="microwave", description="line that switches the drive on")
+    quadrature: str = Field(
+        default="quadrature", description="line that adds the `shift` of the source to the phase of the drive"
+    )
+    push_out: str = Field(
+        default="push_out",
+        description="line that switches on the light that removes atoms in the upper level",
+    )
+    source: str = Field(
+        default="synthesizer",
+        description="device with the frequency and phase of the drive, a `virtual_synthesizer`; without "
+        "one it is on resonance",
+    )
+    transition: Annotated[Frequency, Field(gt=0)] = Field(
+        default=TRANSITION_HZ,
+        description="frequency of the transition (ours: the clock transition of rubidium 87, without shifts)",
+    )
+    rabi_frequency: Annotated[Frequency, Field(ge=0)] = Field(
+        default=20e3, description="frequency on resonance: a pi pulse takes half of its inverse (ours)"
+    )
+    relaxation_time: PositiveDuration = Field(
+        default=20e-3, description="time constant T1 with which the populations become equal (ours)"
+    )
+    coherence_time: PositiveDuration = Field(
+        default=1e-3, description="time constant T2 with which a superposition loses its phase (ours)"
+    )
+    detuning_spread: Annotated[Frequency, Field(ge=0)] = Field(
+        default=0.0,
+        description="s.d. of the transition's frequency from atom to atom and shot to shot, which an echo "
+        "undoes (ours)",
+    )
+    preparation: Fraction = Field(
+        default=0.99, description="probability of the lower level after loading, imaging and cooling (ours)"
+    )
+    push_out_time: PositiveDuration = Field(
+        default=5e-6, description="time constant with which push-out light removes atoms (ours)"
+    )
+    push_out_time_other: PositiveDuration = Field(
+        default=5e-3, description="the same for atoms in the lower level, which it should not remove (ours)"
+    )
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The lines that act on the atoms, if the profile has them."""
+        return self.drive, self.quadrature, self.push_out
+
+    @property
+    def required_lines(self) -> tuple[str, ...]:
+        """The lines that the profile names and must have."""
+        return tuple(getattr(self, key) for key in ("drive", "quadrature", "push_out") if self.is_given(key))
+
+    def is_given(self, key: str) -> bool:
+        """Whether the profile has a setting itself."""
+        return key in self.model_fields_set
+
+
 class SimulationSettings(Settings):
     """Atoms and light of the simulation."""
 
@@ -397,6 +461,9 @@ class SimulationSettings(Settings):
     lights: LightSettings = Field(
         default=LightSettings(), description="which lines each kind of light needs; none: it is always on"
     )
+    qubit: QubitSettings = Field(
+        default=QubitSettings(), description="the two levels of the atoms, and what acts on them"
+    )
     image: ImageSettings = Field(default=ImageSettings(), description="what the camera sees")
     tweezer_image: TweezerImageSettings = Field(
         default=TweezerImageSettings(),
@@ -482,6 +549,21 @@ class LinesSettings(Settings):
     resolution: Duration = Field(default=0.0, description="step of its clock; 0: any time is possible (ours)")
     shortest: Duration = Field(default=1e-6, description="shortest time between two edges (ours)")
     max_edges: PositiveInt = Field(default=1000, description="maximum number of edges of a program (ours)")
+
+
+class SynthesizerSettings(Settings):
+    """A virtual synthesizer, which drives the two levels of the virtual atoms."""
+
+    frequency: Annotated[Frequency, Field(gt=0)] = Field(
+        default=TRANSITION_HZ,
+        description="frequency until it is set (ours: the clock transition of rubidium 87)",
+    )
+    phase: Angle = Field(default=0.0, description="phase until it is set")
+    shift: Angle = Field(
+        default=math.pi / 2,
+        description="what a line adds to the phase, until it is set: see `qubit.quadrature` of the "
+        "simulation (ours)",
+    )
 
 
 class SpotMeterSettings(Settings):

@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,9 @@ from labseq_virtual.tone_positions import TonePositions
 from labseq_virtual.transport import RunningProgram, Transport
 from labseq_virtual.tweezer_kernels import CAUSES
 from labseq_virtual.tweezer_view import TweezerView
+
+if TYPE_CHECKING:
+    from labseq_virtual.qubits import Qubits
 
 MIN_LEVEL: Final = 1e-3
 """Depth, relative to the nominal one, below which a static tweezer counts as having this one."""
@@ -83,7 +86,8 @@ class VirtualSimulation(Simulation):
         self._static = StaticArray(context.grid, settings)
         self._pulse_receiver: PulseReceiver | None = None
         self._noise_hz = noise_hz(settings)
-        self._lights = Lights(settings.lights, context.lines)
+        self._lights = Lights(settings.lights, context.lines, settings.qubit.required_lines)
+        self._sources: dict[str, Mapping[str, float]] = {}
         self._exposure = Exposure(context.grid, settings, self._seed)
         self._is_open = False
         self._reset()
@@ -159,6 +163,7 @@ class VirtualSimulation(Simulation):
             DeviceError: A later event has already been simulated.
         """
         self._begin_event(t_start_s, "loading")
+        self._qubits = None
         on_s = duration_s * self._lights.fraction_on("loading", t_start_s, t_start_s + duration_s)
         reload_probability = -math.expm1(-on_s / self._settings.loading_time)
         draws = self._random.shot.random((2, *self._grid.shape))
@@ -185,6 +190,7 @@ class VirtualSimulation(Simulation):
             self._static.drive(signal)
         elif role == "lines" and isinstance(signal, LineProgram):
             self._lights.switch(signal, t_start_s)
+            self._play_pulses(signal, t_start_s)
             spans, stay_off = self._lights.tweezers_off(signal)
             for start_s, end_s in spans:
                 self._release(t_start_s + start_s, end_s - start_s)
@@ -197,6 +203,10 @@ class VirtualSimulation(Simulation):
     def wire(self, role: str, on_pulse: Callable[[float, float], object]) -> None:
         """Call ``on_pulse`` at every later pulse of the line that triggers a role."""
         self._lights.wire(role, on_pulse)
+
+    def tune(self, device: str, values: Mapping[str, float]) -> None:
+        """Set what a synthesizer puts out: "frequency" in Hz, "phase" and "shift" in rad."""
+        self._sources[device] = values
 
     def connect_outputs(self, role: str, source: RfSource | ToneSource) -> None:
         """Connect the outputs of a driver of tweezers, in place of earlier ones.
@@ -236,6 +246,7 @@ class VirtualSimulation(Simulation):
         image, lost = self._exposure.take(self._atoms.occupied, exposure_s, rng, mode, light_on, power)
         self._lost += lost
         self._now_s = t_start_s + exposure_s
+        self._qubits = None
         aim = self._at_nominal(self._settings.temperature + recoil_heat(self._settings))
         left = math.exp(-exposure_s * light_on / self._settings.cooling_time)
         self._atoms.heat = aim + (self._atoms.heat - aim) * left
@@ -251,7 +262,8 @@ class VirtualSimulation(Simulation):
     def losses(self) -> Mapping[str, int]:
         """Atoms lost since the shot began, by cause."""
         return {
-            cause: self._lost[cause] for cause in ("vacuum", "imaging", "light", "release", "heat", *CAUSES)
+            cause: self._lost[cause]
+            for cause in ("vacuum", "imaging", "light", "release", "push_out", "heat", *CAUSES)
         }
 
     def spot_powers(self) -> NDArray[np.float64]:
@@ -309,6 +321,38 @@ class VirtualSimulation(Simulation):
         self._lost["light"] += self._static.ramp(ramp, self._atoms, self._random.shot)
         self._now_s += ramp.duration_s
 
+    def _play_pulses(self, program: LineProgram, t_start_s: float) -> None:
+        """Apply the pulses of a program to the two levels of the atoms."""
+        settings = self._settings.qubit
+        if not any(program.rising(line) for line in settings.lines if line in program.lines):
+            return
+        self._begin_event(t_start_s, "pulses")
+        from labseq_virtual.qubits import Qubits  # most runs have no pulses
+
+        if self._qubits is None or self._was_cooled(self._qubits.t_s, t_start_s):
+            self._qubits = Qubits(settings, self._grid.shape, t_start_s, self._random.shot)
+        self._lost["push_out"] += self._qubits.play(program, t_start_s, self._drive(), self._atoms)
+
+    def _was_cooled(self, start_s: float, end_s: float) -> bool:
+        """Whether cooling light that lines switch was on, which prepares the atoms anew."""
+        return bool(self._settings.lights.cooling) and self._lights.fraction_on("cooling", start_s, end_s) > 0
+
+    def _drive(self) -> Mapping[str, float]:
+        """What drives the atoms: the output of the source, or resonance without one.
+
+        Raises:
+            DeviceError: The source is not a synthesizer of this profile.
+        """
+        settings = self._settings.qubit
+        if settings.source in self._sources:
+            return self._sources[settings.source]
+        if settings.is_given("source"):
+            text = (
+                f"`qubit.source` is '{settings.source}', which is not a `virtual_synthesizer` of the profile"
+            )
+            raise DeviceError(self._name, text)
+        return {"frequency": settings.transition, "phase": 0.0, "shift": math.pi / 2}
+
     def _release(self, t_start_s: float, dark_s: float) -> None:
         self._begin_event(t_start_s, "a release")
         self._lost["release"] += self._static.release(dark_s, self._atoms, self._random.shot)
@@ -319,7 +363,7 @@ class VirtualSimulation(Simulation):
         """Carry out the running program up to a time."""
         if self._playing is None:
             return
-        playing, self._playing = self._playing, None
+        playing, self._playing, self._qubits = self._playing, None, None
         n_played = playing.n_segments_until(until_s + ROUNDING_S)
         start_s, end_s = playing.t_start_s, min(playing.t_end_s, until_s)
         cooled, factor = self._cooling(start_s, end_s)
@@ -336,6 +380,7 @@ class VirtualSimulation(Simulation):
                 text = f"the mobile tweezers were on at {pulse.start_s:.6f} s, together with something else"
                 raise DeviceError(self._name, f"{text}; wait (mobile_tweezers.wait, camera.read) first")
             self._lose_to_vacuum(pulse.start_s)
+            self._qubits = None
             cooled, factor = self._cooling(pulse.start_s, pulse.end_s)
             depth, rng = self._static.depth, self._random.shot
             if self._atoms.occupied.any():
@@ -399,6 +444,7 @@ class VirtualSimulation(Simulation):
     def _reset(self) -> None:
         self._atoms = Atoms(np.zeros(self._grid.shape, np.bool_), self._settings.temperature)
         self._playing: RunningProgram | None = None
+        self._qubits: Qubits | None = None
         self._now_s = -math.inf
         self._loss_factor = 1.0
         self._lost: Counter[str] = Counter()

@@ -39,7 +39,7 @@ PROFILE = {
     "static_tweezers": "{use: virtual}",
     "mobile_tweezers": "{use: virtual}",
     "detector": "{use: threshold}",
-    "devices": "{shutter: {use: virtual}}",
+    "devices": "{shutter: {use: virtual}, synthesizer: {use: virtual_synthesizer}}",
     "simulation": "{use: virtual}",
 }
 """What an example leaves out."""

@@ -22,6 +22,7 @@ from labseq.errors import DeviceError, LimitError, StopRequested
 from labseq.plugin import Context
 from labseq.sequencer.lines import line_program
 from labseq.testing import LinesContract
+from tests.profiles import virtual_without_lines
 
 from .labseq_ttl_rig import FIRMWARE, make_rig, rig, simulated_by
 
@@ -149,7 +150,6 @@ def test_a_wait_looks_for_a_request_to_stop() -> None:
 
 ROOT = Path(__file__).parents[2]
 SEQUENCE = ROOT / "sequences" / "compact_225.yaml"
-VIRTUAL = ROOT / "hardware_profiles" / "virtual.yaml"
 LINES = """
 lines:
   use: USE
@@ -166,7 +166,7 @@ LIGHTS = "  lights: {loading: [mot], cooling: [cooling], imaging: [imaging, shut
 def profile(folder: Path, use: str) -> str:
     """``virtual`` with lines."""
     path = folder / "with_lines.yaml"
-    text = VIRTUAL.read_text().replace(
+    text = virtual_without_lines().replace(
         "simulation:\n  use: virtual\n", f"simulation:\n  use: virtual\n{LIGHTS}"
     )
     assert LIGHTS in text

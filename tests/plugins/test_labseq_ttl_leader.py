@@ -17,6 +17,7 @@ from labseq.errors import StopRequested
 from labseq.plugin import ConfigError, DeviceError, DeviceTimeoutError, LeaderLink, LineSpec
 from labseq.sequencer.lines import line_program
 from labseq.testing.contracts.instruments import SPECS
+from tests.profiles import virtual_without_lines
 
 from .labseq_ttl_rig import FIRMWARE, Firmware, make_rig
 
@@ -339,7 +340,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_a_run_is_led_through_the_box(tmp_path: Path) -> None:
-    text = (ROOT / "hardware_profiles" / "virtual.yaml").read_text("utf-8")
+    text = virtual_without_lines()
     profile = tmp_path / "led.yaml"
     lines = "{use: ttl, go: {busy: 5, ready: 6, failed: 7}, channels: {mot: {channel: 3, on: [load]}}}"
     profile.write_text(f"{text}\nlines: {lines}\n", "utf-8")

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from labseq_virtual.camera import VirtualCamera
-from labseq_virtual.devices import VirtualDevice, VirtualLines, VirtualSpotMeter
+from labseq_virtual.devices import VirtualDevice, VirtualLines
 from labseq_virtual.lights import Lights
 from labseq_virtual.settings import (
     CameraSettings,
@@ -27,6 +27,7 @@ from labseq_virtual.settings import (
     StaticTweezersSettings,
 )
 from labseq_virtual.simulation import VirtualSimulation
+from labseq_virtual.spot_meter import VirtualSpotMeter
 from labseq_virtual.tweezers import VirtualMobileTweezers, VirtualStaticTweezers
 
 import labseq
@@ -54,6 +55,7 @@ from labseq.testing import (
     StaticTweezersContract,
 )
 from labseq.testing.fakes import FakeClock, RecordingSimulation
+from tests.profiles import virtual_without_lines
 
 
 class TestVirtualCamera(CameraContract):
@@ -388,7 +390,7 @@ def test_without_imaging_light_a_frame_is_dark_and_no_atom_is_lost_to_it() -> No
     assert n_bright["wait"] < 30 < 10 * n_bright["wait"] < n_bright["image"]
 
 
-PROFILE = (ROOT / "hardware_profiles" / "virtual.yaml").read_text("utf-8")
+PROFILE = virtual_without_lines()
 LINES = """
 lines:
   use: virtual

@@ -21,6 +21,7 @@ from labseq.model import (
     StageTiming,
     TargetPattern,
 )
+from labseq.model.records import LineEdge
 from labseq.recording import RunWriter
 
 START = "2026-11-20T10:00:00.000000+00:00"
@@ -125,6 +126,7 @@ def make_shot(
             StageTiming("plan", 2, 1, 0.6, 0.001, 0.003, 0.001),
             StageTiming("prüfen", 2, 0, 0.5, 1e-9, 0.0, 0.01),
         ],
+        edges=[LineEdge(2, "microwave", True, 0.0, 0.5), LineEdge(2, "prüfen", False, 12.5e-6, 0.5)],
         seen_defect_free_cycle=1,
         success=True,
         filling_fraction=0.875,

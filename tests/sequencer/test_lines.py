@@ -11,7 +11,8 @@ from labseq.builtin.rearrange import RearrangeStep
 from labseq.builtin.steps import WaitStep
 from labseq.errors import DeviceError
 from labseq.model import CameraFacts, LineProgram, LineSpec, TimelineEntry
-from labseq.sequencer.lines import idle_program, line_program, margin_s, off_program, spans_on
+from labseq.sequencer.line_spans import spans_on
+from labseq.sequencer.lines import idle_program, line_program, margin_s, off_program
 from labseq.testing.fakes import RecordingCamera, RecordingLines
 from tests.sequencer.rig import IMAGE, LOAD, Rig, given
 

@@ -13,10 +13,11 @@ import pytest
 import labseq
 from labseq.errors import ConfigError
 from labseq.session.check import check
+from tests.profiles import virtual_without_lines
 
 ROOT = Path(__file__).parents[2]
 SEQUENCE = (ROOT / "sequences" / "compact_225.yaml").read_text(encoding="utf-8")
-PROFILE = (ROOT / "hardware_profiles" / "virtual.yaml").read_text(encoding="utf-8")
+PROFILE = virtual_without_lines()
 TIME = "expected a time such as '45 ms' (s, ms, us, ns, min, h)"
 NO_HOOK = "it implements no hook; write '@hookimpl' above 'def labseq_register'"
 
@@ -97,7 +98,9 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
     (
         "a device that the profile lacks",
         {"- image: {exposure: 45 ms}": "- device: {name: shuter, do: open}\n  - image: {exposure: 45 ms}"},
-        ["s.yaml:12:20: the profile 'virtual' has no device 'shuter'; expected 'shutter'"],
+        [
+            "s.yaml:12:20: the profile 'virtual' has no device 'shuter'; expected one of 'shutter', 'synthesizer'"
+        ],
     ),
     (
         "tones outside the AOD's band",
@@ -118,7 +121,7 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
         {"- image: {exposure: 45 ms}": "- image: {exposure: 11 s}"},
         [
             "s.yaml:12:23: camera: exposure is 11 s; the limit is more than 0 and at most 10 s; choose another exposure",
-            "p.yaml:118:9: device calls time out after 10 s, but an exposure takes 11 s; expected more than 11 s",
+            "p.yaml:126:9: device calls time out after 10 s, but an exposure takes 11 s; expected more than 11 s",
         ],
     ),
     (

@@ -98,7 +98,7 @@ def test_a_wrong_plan_is_stopped_before_anything_plays(tmp_path, batches, rule):
     assert "check" in stages
     assert not {"prepare", "play"} & set(stages)
     safe = [v["device"] for v in seen.of("safe_state")]
-    assert safe == ["mobile_tweezers", "shutter", "camera", "static_tweezers"]
+    assert safe == ["mobile_tweezers", "shutter", "synthesizer", "lines", "camera", "static_tweezers"]
     (index,) = (tmp_path / "data").glob("*/*/index.jsonl")
     (line,) = [json.loads(text) for text in index.read_text().splitlines()]
     assert line["status"] == "failed"
