@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from labseq.model import TimelineEntry
 from labseq.model.lines import IDLE, NO_PULSES, LineProgram, LineSpec, Pulses, Span, lines_of, margin_s
@@ -48,17 +48,20 @@ def line_program(
         for spec in specs
     ]
     times = _apart([0.0, *(t for of_line in spans for span in of_line for t in span), over_s])
-    states = np.zeros((len(times), len(specs)), np.bool_)
+    states = [[False] * len(specs) for _ in times]  # arrays this small take longer, and atoms may wait
     for column, (spec, of_line) in enumerate(zip(specs, spans, strict=True)):
         is_idle = IDLE in spec.on and not spec.pulse_s
-        states[:, column] = is_idle and kind in spec.on  # on before, in and after it
+        if is_idle and kind in spec.on:  # on before, in and after it
+            of_line = [(0.0, over_s)]
         for start, stop in of_line:
-            first, last = np.searchsorted(times, (start - TIMES_APART_S, stop - TIMES_APART_S))
-            states[first:last, column] = True
-        states[-1, column] = is_idle
-    changes = np.concatenate([[True], (states[1:] != states[:-1]).any(axis=1)])
-    names = tuple(spec.name for spec in specs)
-    return LineProgram(kind, names, times[changes], states[changes], begin_s, over_s)
+            edges = bisect_left(times, start - TIMES_APART_S), bisect_left(times, stop - TIMES_APART_S)
+            for state in states[slice(*edges)]:
+                state[column] = True
+        states[-1][column] = is_idle
+    changes = [i for i, state in enumerate(states) if i == 0 or state != states[i - 1]]
+    t_s = np.array([times[i] for i in changes])
+    on = np.array([states[i] for i in changes], np.bool_).reshape(len(changes), len(specs))
+    return LineProgram(kind, tuple(spec.name for spec in specs), t_s, on, begin_s, over_s)
 
 
 def idle_program(specs: Sequence[LineSpec]) -> LineProgram:
@@ -95,10 +98,10 @@ def _span(spec: LineSpec, kind: str, begin_s: float, end_s: float) -> tuple[Span
     return ((start_s, start_s + spec.pulse_s if spec.pulse_s else end_s + spec.lag_s),)
 
 
-def _apart(times: Iterable[float]) -> NDArray[np.float64]:
+def _apart(times: Iterable[float]) -> list[float]:
     """Sorted times, without any that are too close to the one before; 0 stays 0."""
     kept: list[float] = []
     for t in sorted(times):
         if not kept or t - kept[-1] > TIMES_APART_S:
             kept.append(t)
-    return np.array(kept)
+    return kept

@@ -370,7 +370,9 @@ class RunningShot:
         pulses: Pulses = NO_PULSES,
     ) -> Generator[None]:
         """Fire the lines of a kind of step around it; see ``labseq.roles.Shot``."""
-        lines, timeout_s, specs = self.lab.lines, self.call_timeout_s, self.lab.line_specs
+        timeout_s, specs = self.call_timeout_s, self.lab.line_specs
+        # lines that only pulses turn on need no program in other steps
+        lines = self.lab.lines if pulses or any(spec.on for spec in specs) else None
         is_triggered = start is not None and trigger_line(specs, "mobile_tweezers") is not None
         if start is not None and (lines is None or is_triggered):
             start()
