@@ -84,7 +84,7 @@ def replay(
     1 if they do not.
     """
     from labseq.analysis.replay import ReplayRequest
-    from labseq.analysis.terminal import replay_run
+    from labseq.analysis.replay_report import replay_run
 
     request = ReplayRequest(planner, dop, detector, tuple(overrides or ()), shots)
     raise typer.Exit(replay_run(run, request, output, as_json=as_json))
@@ -118,8 +118,8 @@ def analyse(
 
     If the settings differ from those of the existing results, all shots are analysed again.
     """
+    from labseq.analysis.analysing import analyse_run
     from labseq.analysis.scanned import scan_request
-    from labseq.analysis.terminal import analyse_run
 
     request = scan_request([] if where and scan is None else scan, fit, fit_set, along)
     raise typer.Exit(analyse_run(run, use, overrides or (), request, where, again=again))
@@ -179,8 +179,8 @@ def plot(
 
     Of a campaign's folder, draw filling and defect-free fraction at its points.
     """
+    from labseq.analysis.plotting import PlotRequest, plot_run
     from labseq.analysis.scanned import scan_request
-    from labseq.analysis.terminal import PlotRequest, plot_run
 
     scanned = scan_request(scan, fit, fit_set, along)
     request = PlotRequest(what, shot, cycle, scanned, tuple(sites or ()), tuple(where or ()))

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from labseq.units import format_quantity
+
+MAX_REPORTED: Final = 5
+"""Maximum number of failures that are printed one by one."""
 
 
 def plural(n: int, noun: str) -> str:
@@ -115,3 +118,14 @@ def encodes(encoding: str | None, characters: str) -> bool:
     except (UnicodeEncodeError, LookupError):
         return False
     return True
+
+
+def first_of(failures: Sequence[str], rest: str) -> list[str]:
+    """The first failures, and how many there are more.
+
+    Example:
+        >>> first_of(["no light", "no frame"], "more"), first_of(list("abcdefg"), "more")[-1]
+        (['no light', 'no frame'], 'and 2 more')
+    """
+    n_more = len(failures) - MAX_REPORTED
+    return [*failures[:MAX_REPORTED], *([f"and {n_more} {rest}"] if n_more > 0 else [])]

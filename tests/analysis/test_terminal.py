@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 
 import labseq
+from labseq.analysis.analysing import analyse_run
 from labseq.analysis.overview import scan_picture
 from labseq.analysis.replay import ReplayRequest
+from labseq.analysis.replay_report import replay_run
 from labseq.analysis.scanned import ScanRequest
-from labseq.analysis.terminal import analyse_run, replay_run
 from labseq.data.scanned import FitRequest
 from labseq.errors import ConfigError
 

@@ -10,7 +10,7 @@ from matplotlib import colormaps
 
 import labseq
 from labseq.analysis.charts import COLOURS
-from labseq.analysis.terminal import PlotRequest, plot_run
+from labseq.analysis.plotting import PlotRequest, plot_run
 from labseq.cli import main
 from labseq.errors import ConfigError
 from labseq.pictures.figures import LIGHT
