@@ -17,7 +17,7 @@ from typing import Any, Final, cast
 
 import labseq
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.files import read_file, whole_file
+from labseq.files import make_folder, read_file, whole_file
 from labseq.messages import visible
 from labseq.model import CalibrationEntry, CalibrationKind, SiteGrid, grid_facts, same_grid
 from labseq.plain import now_utc, parse_object
@@ -337,7 +337,7 @@ class Store:
         """
         stem = stem_of(entry)
         with self._write_errors():
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self.folder)
             for n in count(1):
                 path = self.folder / (f"{stem}{SUFFIX}" if n == 1 else f"{stem}-{n}{SUFFIX}")
                 try:
@@ -423,7 +423,7 @@ class Store:
         """Add an activation to the history, unless nothing changes."""
         path, deadline = self.folder / ACTIVE_FILE, time.monotonic() + MAX_WAIT_S
         with self._write_errors():
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self.folder)
             while True:
                 try:
                     with whole_file(path, alone=True) as file:

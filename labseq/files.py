@@ -83,12 +83,42 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+def make_folder(path: Path, *, is_new: bool = False) -> None:
+    """Make a folder, and those above it, in which the group may write if it may in the folder around it.
+
+    Args:
+        path: The folder.
+        is_new: Whether there must be no such folder yet.
+
+    Raises:
+        OSError: It cannot be made.
+    """
+    if not path.parent.is_dir():
+        make_folder(path.parent)
+    try:
+        path.mkdir()
+    except FileExistsError:
+        if is_new or not path.is_dir():
+            raise
+    else:
+        share_with_group(path)
+
+
+def share_with_group(path: Path) -> None:
+    """Let the group write to a new file or folder if it may write to the folder around it.
+
+    The usual umask would leave the folder of a day to the user whose run is the first.
+    """
+    with suppress(OSError):
+        around, own = path.parent.stat(), path.stat()
+        if around.st_mode & stat.S_IWGRP and around.st_gid == own.st_gid and os.name != "nt":
+            path.chmod(stat.S_IMODE(own.st_mode) | stat.S_IWGRP)
+
+
 _ELSEWHERE: Final = "choose another place with --output or LABSEQ_DATA"
 _ADVICE: Final = {
     errno.ENOSPC: f"the disk is full; free some space, or {_ELSEWHERE}",
     errno.EDQUOT: f"your disk quota is used up; free some space, or {_ELSEWHERE}",
-    errno.EACCES: f"labseq has no permission to write there; {_ELSEWHERE}",
-    errno.EPERM: f"labseq has no permission to write there; {_ELSEWHERE}",
     errno.EROFS: f"the disk is read-only; {_ELSEWHERE}",
     errno.ENOTDIR: f"a file is in the way of a folder; move it, or {_ELSEWHERE}",
     errno.EEXIST: f"a file is in the way of a folder; move it, or {_ELSEWHERE}",
@@ -109,7 +139,22 @@ def explained(path: Path) -> Generator[None]:
     except OSError as error:
         reason = error.strerror or str(error)
         advice = _ADVICE.get(error.errno or 0, f"check the disk, or {_ELSEWHERE}")
+        if isinstance(error, PermissionError):
+            advice = f"labseq has no permission to write there; {_whose(path)}{_ELSEWHERE}"
         raise RecordingError(path, f"cannot be written: {reason}", advice) from error
+
+
+def _whose(path: Path) -> str:
+    """Who may let others write to a file or its folder; "" if this user may, or if that is unknown."""
+    with suppress(OSError, NotImplementedError):
+        existing = next(place for place in (path, *path.parents) if place.exists())
+        owner = f"user {existing.stat().st_uid}"
+        with suppress(KeyError):  # an account of another computer that shares the disk
+            owner = existing.owner()
+        if not os.access(existing, os.W_OK):
+            who = f"{existing} belongs to {owner}"
+            return f"{who}, who can let the group write with 'chmod -R g+w {existing}'; or "
+    return ""
 
 
 MAX_LINE: Final = 16 << 20
@@ -204,6 +249,8 @@ class LineLog:
         self.path = path
         with explained(path), path.open("a+b", buffering=0) as file:
             self._length = file.seek(0, os.SEEK_END)
+            if not self._length:
+                share_with_group(path)
             file.seek(max(0, self._length - 1))
             if file.read(1) not in (b"", b"\n"):
                 self._length += file.write(b"\n")

@@ -9,7 +9,7 @@ import platform
 import signal
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq.errors import RecordingError
-from labseq.files import FOR_ALL, read_file, write_shared
+from labseq.files import FOR_ALL, make_folder, read_file, write_shared
 from labseq.plain import now_utc, parse_object
 
 if TYPE_CHECKING:
@@ -184,26 +184,33 @@ class Lock:
         self._about = path.with_name(f"{path.name}.holder")
         self._holder = Holder(purpose, Process.current(), now_utc("seconds"))
 
-    def take(self) -> Holder | None:
+    def take(self, warn: Callable[[str], None] | None = None) -> Holder | None:
         """Take the lock if it is free.
+
+        Args:
+            warn: Told if the folder, perhaps on a network, has no locks; without it that is an error.
 
         Returns:
             None, or the holder if it is not free.
 
         Raises:
-            OSError: The file cannot be made; or its folder has no locks, see :func:`knows_no_locks`.
+            OSError: The file cannot be made, or its folder has no locks.
         """
         from filelock import FileLock, Timeout  # takes 0.05 s to import
 
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(self.path.parent)
         # without fallback_to_soft=False it would use a lock file, which outlives its holder
         lock = FileLock(self.path, timeout=0, mode=FOR_ALL, thread_local=False, fallback_to_soft=False)
         try:
             lock.acquire()
         except Timeout:
             return self.holder() or Holder()
-        except NotImplementedError as error:
-            raise OSError(errno.ENOSYS, str(error)) from error
+        except (NotImplementedError, OSError) as error:
+            failure = error if isinstance(error, OSError) else OSError(errno.ENOSYS, str(error))
+            if warn is None or not _knows_no_locks(failure):
+                raise failure from error
+            warn(f"{self.path.parent} does not support file locks: another process could work there, too")
+            return None
         self._lock = lock
         self.describe(self._holder.purpose)
         return None
@@ -242,7 +249,7 @@ class Lock:
             return None
 
 
-def knows_no_locks(error: OSError) -> bool:
+def _knows_no_locks(error: OSError) -> bool:
     """Whether a lock failed because its folder, perhaps on a network, does not support locks."""
     return error.errno in {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP}
 

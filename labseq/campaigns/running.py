@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import platform
+import sys
 from collections.abc import Callable, Generator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, PlannedRun, Point, run_folders
 from labseq.config.document import Document
+from labseq.console.output import say
 from labseq.data import Run, open_run
 from labseq.errors import AlarmError, ConfigError, LabseqError, Problem
 from labseq.files import explained, write_file
@@ -90,13 +92,12 @@ def campaign_folder(campaign: Campaign, folder: Path, inputs: CampaignInputs) ->
         ConfigError: Another process uses it; or its runs belong to other files or another campaign.
         RecordingError: A run is damaged, or the folder cannot be written to.
     """
-    with explained(folder):
-        folder.mkdir(parents=True, exist_ok=True)
     lock = Lock(folder / LOCK_FILE, "labseq campaign run")
-    with suppress(OSError):  # some network drives have no locks
-        if (holder := lock.take()) is not None:
-            what, hint = f"this campaign is in progress: {holder}", "wait until it ends, or stop that command"
-            raise ConfigError(Problem(what, visible(str(folder)), hint=hint))
+    with explained(folder):
+        holder = lock.take(lambda text: say(f"warning: {text}", stream=sys.stderr))
+    if holder is not None:
+        what, hint = f"this campaign is in progress: {holder}", "wait until it ends, or stop that command"
+        raise ConfigError(Problem(what, visible(str(folder)), hint=hint))
     try:
         yield _missing(campaign, folder, inputs)
     finally:

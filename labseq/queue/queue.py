@@ -18,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from labseq.assembly.options import Options
 from labseq.config.document import StoredText
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.files import explained, read_file, write_file
+from labseq.files import explained, make_folder, read_file, write_file
 from labseq.messages import visible
 from labseq.plain import dumps, now, now_utc, parse_object
 from labseq.processes import Holder, Lock, Process
@@ -215,7 +215,7 @@ class Queue:
     def _write(self, folder: Path, entry: Entry) -> None:
         values = {"format": FORMAT, **_adapter().dump_python(entry, mode="json")}
         with explained(folder):
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
         write_file(folder / f"{entry.id:04d}.json", dumps(values, indent=1).encode() + b"\n")
 
     def remove(self, ids: Sequence[int]) -> None:
@@ -286,7 +286,7 @@ class Queue:
         path = self.folder / PAUSE_FILE
         with explained(path):
             if is_paused:
-                self.folder.mkdir(parents=True, exist_ok=True)
+                make_folder(self.folder)
                 path.touch()
             else:
                 path.unlink(missing_ok=True)
@@ -317,7 +317,7 @@ class Queue:
     def _new_id(self) -> int:
         """A number that no entry has or had; the file ``<number>.id`` marks the last one as used."""
         with explained(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self.folder)
             while True:
                 used = [
                     int(match[1]) for path in self.folder.iterdir() if (match := _NUMBER.fullmatch(path.name))

@@ -147,7 +147,7 @@ class QueueRun:
         """
         lock = self.queue.lock()
         with explained(self.queue.folder):
-            holder = lock.take()
+            holder = lock.take(lambda text: say(f"warning: {text}", stream=sys.stderr))
         if holder is not None:
             raise ConfigError(Problem(f"the queue is already being run: {holder}", str(self.queue.folder)))
         self.queue.clear_stop()

@@ -22,6 +22,7 @@ from labseq.files import (
     check_ordinary,
     explained,
     lines_in,
+    make_folder,
     open_ordinary,
     sync_folder,
     write_file,
@@ -500,7 +501,7 @@ def _log_move(folder: Path, what: str, path: Path, goal: Path) -> None:
 def _quarantine_of(folder: Path) -> Path:
     place = folder / QUARANTINE
     with explained(place):
-        place.mkdir(exist_ok=True)
+        make_folder(place)
     return place
 
 

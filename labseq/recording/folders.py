@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from labseq.errors import RecordingError
-from labseq.files import data_root, explained, is_there, sync_folder
+from labseq.files import data_root, explained, is_there, make_folder, sync_folder
 
 RUN_FILE: Final = "run.json"
 STATE_FILE: Final = "STATE"
@@ -92,7 +92,7 @@ def make_run_folder(root: Path, name: str, started: datetime) -> Path:
     """
     day = root / started.astimezone().date().isoformat()
     with explained(day):
-        day.mkdir(parents=True, exist_ok=True)
+        make_folder(day)
         sync_folder(root)
         counter = max(_counters(day), default=0)
     while True:
@@ -108,7 +108,7 @@ def make_run_folder(root: Path, name: str, started: datetime) -> Path:
                 # another process may have made the folder and given up its claim since the first look
                 if any(n == counter for n in _counters(day, claims=False)):
                     continue
-                folder.mkdir()
+                make_folder(folder, is_new=True)
                 sync_folder(day)
                 return folder
             finally:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
-from labseq.files import LineLog, NewLines, explained, write_file
+from labseq.files import LineLog, NewLines, explained, make_folder, write_file
 from labseq.messages import clean, format_plugin_error
 from labseq.plain import dumps, plain_text
 from labseq.recording import folders
@@ -58,7 +58,7 @@ class ResultsLog:
     def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
         self.path = path
         with explained(path):
-            path.parent.mkdir(exist_ok=True)
+            make_folder(path.parent)
         self._log = LineLog(path)
         self._log.append(about, sync=True)
 
@@ -98,7 +98,7 @@ class ResultsLog:
         if large:
             path = _arrays_file(self.path, shot)
             with explained(path):
-                path.parent.mkdir(exist_ok=True)
+                make_folder(path.parent)
             write_file(path, _encoded({names[name]: (name, array) for name, array in large.items()}))
         row = {
             name: {ARRAY: names[name], "shape": value.shape, "dtype": value.dtype.name}

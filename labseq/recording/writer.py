@@ -17,7 +17,7 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar
 
 from labseq.errors import DeviceError, DeviceHungError, RecordingError, StopRequested
-from labseq.files import LineLog, explained, sync_folder, write_file
+from labseq.files import LineLog, explained, make_folder, sync_folder, write_file
 from labseq.guard import Guard, StopFlag
 from labseq.model import RunRecord, ShotRecord
 from labseq.model.image_quantities import measured_in
@@ -96,7 +96,7 @@ class RunWriter:
         run_dir = folders.make_run_folder(root, run.name, datetime.fromisoformat(run.t_start_utc))
         try:
             with explained(run_dir):
-                (run_dir / folders.SHOTS_FOLDER).mkdir()
+                make_folder(run_dir / folders.SHOTS_FOLDER)
             # run.json comes last: without one, a folder holds no shots and may be deleted
             write_file(run_dir / folders.STATE_FILE, encode_state("running"))
             texts = {folders.SEQUENCE_FILE: run.sequence_text, folders.PROFILE_FILE: run.profile_text}

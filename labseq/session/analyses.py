@@ -26,10 +26,11 @@ from labseq.assembly.recorded import context_of, plugins_of, resolved_of
 from labseq.config.validation import validate_values
 from labseq.data import Run, open_run
 from labseq.data.follower import Follower
-from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
+from labseq.errors import ConfigError, LabseqError, Problem
+from labseq.files import explained
 from labseq.messages import format_plugin_error
 from labseq.plain import now_utc
-from labseq.processes import Lock, knows_no_locks
+from labseq.processes import Lock
 from labseq.recording.results import AGAIN, ResultsLog, read_results, results_file, shots_with_result
 from labseq.roles import Analysis, RecordedShot
 from labseq.session.analysis_processes import FAILED, FINISH_WITHIN, USE
@@ -187,14 +188,8 @@ def _alone(path: Path, name: str) -> Generator[None]:
         RecordingError: The folder cannot be written to.
     """
     lock = Lock(path.with_name(f".{path.stem}.lock"), f"the analysis '{name}'")
-    try:
-        holder = lock.take()
-    except OSError as error:
-        if not knows_no_locks(error):
-            raise RecordingError(
-                path.parent, f"cannot be written: {error.strerror}", "check the disk"
-            ) from error
-        holder = None
+    with explained(path.parent):
+        holder = lock.take(lambda text: print(f"warning: {text}", file=sys.stderr))  # noqa: T201 - or its log
     if holder is not None:
         what = f"the results of '{name}' are being written by {holder}"
         raise ConfigError(Problem(what, str(path), hint="wait until it has finished"))

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from labseq.data import Run, open_run
 from labseq.errors import DeviceError, LabseqError
-from labseq.files import check_ordinary
+from labseq.files import check_ordinary, make_folder
 from labseq.guard import StopFlag
 from labseq.messages import clean, did_you_mean, listing
 from labseq.recording.folders import RESULT_PREFIX
@@ -208,7 +208,7 @@ class _AnalysisProcess:
         self._finish_within_s = float(analysis[FINISH_WITHIN])
         self._has_warned = False
         self._log = results_file(run_dir, name).with_suffix(".log")
-        self._log.parent.mkdir(exist_ok=True)
+        make_folder(self._log.parent)
         self._results_file = results_file(run_dir, name)
         self._results = Results(self._results_file)
         self._size_before = self._size()

@@ -18,7 +18,7 @@ from labseq.guard import StopFlag
 from labseq.messages import visible
 from labseq.model import RunRecord
 from labseq.plain import now_utc
-from labseq.processes import Lock, knows_no_locks
+from labseq.processes import Lock
 from labseq.recording import RunWriter
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, RUN_FILE, SOURCES_FILE, find_run
 from labseq.recording.index import IndexRow
@@ -68,16 +68,8 @@ class ResumableRun:
         folder = find_run(path)
         _check(folder)  # before anything is written there
         lock, warnings = Lock(folder / LOCK_FILE, "labseq resume"), list[str]()
-        try:
-            with explained(folder):
-                holder = lock.take()
-        except RecordingError as error:
-            if not (isinstance(error.__cause__, OSError) and knows_no_locks(error.__cause__)):
-                raise
-            holder = None
-            warnings.append(
-                f"{folder} does not support file locks: another process could resume the run at the same time"
-            )
+        with explained(folder):
+            holder = lock.take(warnings.append)
         if holder is not None:
             raise _refused(folder, f"another process is already resuming it: {holder}")
         try:

@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import stat
 import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -19,8 +20,10 @@ import pytest
 
 from labseq.data import open_run
 from labseq.errors import RecordingError
+from labseq.files import explained
 from labseq.model import RunRecord
 from labseq.recording import RunWriter
+from labseq.recording.results import ResultsLog
 
 from .records import make_run, make_shot
 
@@ -165,6 +168,28 @@ def test_a_full_disk_loses_events_and_counts_them(tmp_path: Path, monkeypatch: p
         ("back", 2),
         ("again", None),
     ]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such permissions")
+@pytest.mark.parametrize("mode", [0o755, 0o2775])
+def test_a_run_takes_the_groups_permission_to_write_from_its_data_folder(tmp_path: Path, mode: int) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data").chmod(mode)
+    run_dir = RunWriter.create(tmp_path / "data", make_run()).run_dir
+    ResultsLog(run_dir / "analysis" / "mine.jsonl", {})
+    shared = ("..", ".", "shots", "analysis", "index.jsonl", "events.jsonl", "analysis/mine.jsonl")
+    modes = [(run_dir / name).stat().st_mode for name in shared]
+    assert [bool(of_file & stat.S_IWGRP) for of_file in modes] == [mode == 0o2775] * len(shared)
+
+
+def test_a_place_that_another_user_owns_says_whose_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    with pytest.raises(RecordingError) as caught, explained(tmp_path / "run" / "index.jsonl"):
+        raise PermissionError(errno.EACCES, "Permission denied")
+    assert f"{tmp_path} belongs to {tmp_path.owner()}, who can let the group write" in str(caught.value)
+    assert f"chmod -R g+w {tmp_path}" in str(caught.value)
 
 
 def test_a_place_that_cannot_be_written_to_is_explained(tmp_path: Path) -> None:
