@@ -58,6 +58,10 @@ _HOMES = {
         "Run",
         "open_run",
     ),
+    "labseq.data.catalogue": (
+        "RunEntry",
+        "runs",
+    ),
     "labseq.session.session": ("Session",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

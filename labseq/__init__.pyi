@@ -10,6 +10,10 @@ from labseq.data import (
     Run as Run,
     open_run as open_run,
 )
+from labseq.data.catalogue import (
+    RunEntry as RunEntry,
+    runs as runs,
+)
 from labseq.errors import (
     ConfigError as ConfigError,
     DeviceError as DeviceError,

@@ -30,7 +30,6 @@ from labseq.analysis.charts import (
 )
 from labseq.analysis.scanned import (
     ScanRequest,
-    own_fits,
     scan_report,
     shown_unit,
     title_of,
@@ -42,6 +41,7 @@ from labseq.data import Run, Shot
 from labseq.data.fits import Fit, readable
 from labseq.data.images import loading_map
 from labseq.data.quantities import WITH_TARGET, Quantity, measured_by, quantity_of, steps_that_load
+from labseq.data.results import own_fits
 from labseq.data.scanned import FitAt, Scanned, is_geometric, scanned
 from labseq.data.site_maps import SiteMap, site_map
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites

@@ -19,10 +19,10 @@ from labseq.data.quantities import (
     description_of,
     find_quantity,
     measured_by,
-    measures_of,
     quantity_of,
 )
-from labseq.data.scanned import FitAt, FitRequest, Scanned, fits_along, request_of, scanned
+from labseq.data.results import own_fits, reported
+from labseq.data.scanned import FitAt, FitRequest, Scanned, fits_along, scanned
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.model.estimate import Estimate, Estimated, Rate
@@ -209,30 +209,17 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
     return ScanReport(scan, values, fits)
 
 
-def own_fits(run: Run, scan: Scanned, quantity: Quantity, means: Sequence[Estimated]) -> list[FitAt]:
-    """The fits of a quantity that the run's sequence asks for; a fit that fails is a problem in them."""
-    wanted = next((one for one in measures_of(run) if one["value"] == quantity.name and "fit" in one), None)
-    if wanted is None or not scan.axes:
-        return []
-    try:
-        return fits_along(run, scan, quantity, means, request_of(wanted))
-    except ConfigError as error:
-        problem = "; ".join(problem.what for problem in error.problems)
-        return [FitAt({}, {}, None, f"no fit {wanted['fit']}: {problem}")]
-
-
 def results_of(run: Run, report: ScanReport) -> list[tuple[str, str]]:
     """The results of a run: name and value of the parameter that its sequence asks for, in each fit."""
-    reported = {one["value"]: one.get("report") for one in measures_of(run)}
     rows: list[tuple[str, str]] = []
     is_one = sum(map(bool, report.fits)) == 1
     for (quantity, _), fits in zip(report.values, report.fits, strict=False):
         for at in fits:
-            name = reported.get(quantity.name) or (next(iter(at.fit.free), "") if at.fit else "")
-            if at.fit is not None and name in at.fit.parameters:
-                where = "".join(f", {word}" for word in at.written.values())
+            result = reported(run, quantity, at)
+            if at.fit is not None and result is not None:
+                where = f", {result.at}" if result.at else ""
                 of = "" if is_one else f" of {title_of(quantity)}"
-                rows.append((f"{name}{of}{where}", f"{at.fit.parameters[name]}{_doubt(at.fit)}"))
+                rows.append((f"{result.name}{of}{where}", f"{result.value}{_doubt(at.fit)}"))
             elif at.problem:
                 rows.append((title_of(quantity), at.problem))
     return rows

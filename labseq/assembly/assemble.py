@@ -99,7 +99,7 @@ class Assembly:
         n_shots = self.sequence.shots
         if self.scanned is None:
             return [0] * n_shots
-        return self.scanned.scan.points_of_shots(seed)[:n_shots].tolist()
+        return self.scanned.scan.points_of_shots(seed, n_shots).tolist()
 
     def scan_record(self, seed: int) -> dict[str, Any]:
         """The scan for the run's record, JSON-ready; empty without one."""
@@ -170,7 +170,7 @@ def assemble(
 
 
 def assemble_recorded(recorded: RecordedFiles, options: Options) -> Assembly:
-    """Assemble a run from the files and calibrations that it began with; see :func:`assemble`."""
+    """Assemble a run from files and calibrations of a recorded one; see :func:`assemble`."""
     options = replace(options, profile=recorded.profile_path)
     return assemble(recorded.sequence_path, options, kept=recorded.sequence, recorded=recorded)
 

@@ -58,14 +58,14 @@ class RecordedFiles(NamedTuple):
         sequence: Its text.
         profile_path: Where the profile was.
         profile: Its text.
-        calibrations: Kind -> id of the calibrations; no others are active.
+        calibrations: Kind -> id of the calibrations, no others are active; None for those in use today.
     """
 
     sequence_path: Path
     sequence: StoredText
     profile_path: Path
     profile: StoredText
-    calibrations: Mapping[str, str]
+    calibrations: Mapping[str, str] | None
 
 
 def files_of(run: Run) -> RecordedFiles:

@@ -69,11 +69,18 @@ RESUME_EXAMPLES: Final = """\b
 Examples:
   labseq resume data/2026-01-02/0001_compact-225
   labseq resume data/2026-01-02/0001_compact-225 --accept-changes
+  labseq resume 75 --shots 400
+"""
+RERUN_EXAMPLES: Final = """\b
+Examples:
+  labseq rerun 75
+  labseq rerun 2026-11-20/75 --same-seed --note "with the new camera"
 """
 RUNS_EXAMPLES: Final = """\b
 Examples:
   labseq runs
-  labseq runs --name kagome --limit 5
+  labseq runs --sequence lifetime --since 2026-11-01 --where "decay > 20 s"
+  labseq runs --search "new lens" --sort decay
   labseq show kagome
 """
 NOTE_EXAMPLES: Final = """\b
@@ -183,9 +190,17 @@ def run(
     run_sequence(sequence, options, as_json=as_json, web=web)
 
 
-@app.command(epilog=RESUME_EXAMPLES, short_help="Resume a run that ended early.")
+@app.command(epilog=RESUME_EXAMPLES, short_help="Resume a run that ended early, or add shots to a run.")
 def resume(
     run: Annotated[Path, run_argument("The run's folder, name or number.")],
+    shots: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Give the run more shots, N in all; it may be complete. A scan begins again after its last "
+            "shot.",
+        ),
+    ] = None,
     accept_changes: Annotated[
         bool,
         typer.Option(
@@ -197,10 +212,36 @@ def resume(
     realtime: Realtime = False,
     _plugins: Plugins = None,
 ) -> None:
-    """Take the missing shots of a run that was stopped, failed or crashed."""
+    """Take the missing shots of a run that was stopped, failed or crashed, or more shots."""
     from labseq.cli.run import resume_run
 
-    resume_run(run, {"accept_changes": accept_changes, "realtime": realtime}, as_json=as_json)
+    options = {"shots": shots, "accept_changes": accept_changes, "realtime": realtime}
+    resume_run(run, options, as_json=as_json)
+
+
+@app.command(epilog=RERUN_EXAMPLES, short_help="Take a run again.")
+def rerun(
+    run: Annotated[Path, run_argument("The run's folder, name or number.")],
+    same_seed: Annotated[bool, typer.Option("--same-seed", help="Take its random numbers, too.")] = False,
+    shots: Annotated[
+        int | None, typer.Option(metavar="N", help="Number of shots, instead of that of the earlier run.")
+    ] = None,
+    output: Output = None,
+    note: Note = "",
+    tags: Tags = None,
+    as_json: Json = False,
+    realtime: Realtime = False,
+    _plugins: Plugins = None,
+) -> None:
+    """Take a run again, as a new run with the same sequence, profile and options.
+
+    The texts of the files are those that the earlier run began with; plugins and calibrations are those of
+    today. What differs from the earlier run is printed before the first shot.
+    """
+    from labseq.cli.run import rerun_run
+
+    options = {"same_seed": same_seed, "shots": shots, "output": output, "realtime": realtime}
+    rerun_run(run, {**options, "note": note, "tags": tuple(tags or ())}, as_json=as_json)
 
 
 @app.command(short_help="End a run in progress after its current shot.")
@@ -293,21 +334,62 @@ def runs(
             metavar="DATA", help="A data folder; default: LABSEQ_DATA or ./data.", show_default=False
         ),
     ] = None,
-    name: Annotated[
+    search: Annotated[
         str,
-        typer.Option(metavar="TEXT", help="Only runs with this in their name or date.", show_default=False),
+        typer.Option(
+            metavar="TEXT",
+            help="Only runs whose name, date, note, tags, state, profile, scanned or changed settings or "
+            "results have all these words.",
+        ),
     ] = "",
-    limit: Annotated[int, typer.Option(metavar="N", min=1, help="Only the newest N runs.")] = 20,
+    since: Annotated[
+        str, typer.Option(metavar="DATE", help="Only runs of this day, 2026-11-20, or later.")
+    ] = "",
+    until: Annotated[str, typer.Option(metavar="DATE", help="Only runs of this day or earlier.")] = "",
+    sequence: Annotated[str, typer.Option(metavar="NAME", help="Only runs of this sequence.")] = "",
+    tag: Annotated[str, typer.Option(metavar="TAG", help="Only runs with this tag.")] = "",
+    status: Annotated[
+        str,
+        typer.Option(
+            metavar="STATE", help="Only runs that are running, complete, stopped, failed or damaged."
+        ),
+    ] = "",
+    where: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="CONDITION",
+            help="Only runs with a result, a changed setting or a number of shots that meets a condition: "
+            "'decay > 2 s', 'shots >= 100'; may be given several times.",
+        ),
+    ] = None,
+    sort: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Sort by a result, a changed setting or the shots, the greatest last, with -NAME the least "
+            "last; default: by time, the newest last.",
+        ),
+    ] = "",
+    limit: Annotated[int, typer.Option(metavar="N", min=1, help="At most N runs, the last ones.")] = 20,
     as_json: Json = False,
 ) -> None:
-    """List the runs in a data folder, the newest last.
+    """List the runs in a data folder, the newest last: what each has scanned and measured, and its note.
 
-    The first column is the name by which all commands accept a run. Its number or the name of its sequence
+    The first column is a name by which all commands accept a run. Its number or the name of its sequence
     will do; it is then the newest of them.
     """
-    from labseq.cli.runs import list_runs
+    from labseq.cli.runs import RunQuery, list_runs
 
-    list_runs(data, name, limit, as_json=as_json)
+    conditions = {
+        "since": since,
+        "until": until,
+        "sequence": sequence,
+        "tag": tag,
+        "status": status,
+        "search": search,
+        "where": where or (),
+    }
+    list_runs(data, RunQuery(conditions, sort, limit), as_json=as_json)
 
 
 @app.command(epilog=NOTE_EXAMPLES, short_help="Write a note about a run, or tag it.")

@@ -1,4 +1,4 @@
-"""`labseq run`, `labseq resume`, `labseq stop` and `labseq demo`."""
+"""`labseq run`, `labseq resume`, `labseq rerun`, `labseq stop` and `labseq demo`."""
 
 from __future__ import annotations
 
@@ -47,12 +47,21 @@ def run_sequence(sequence: Path, options: Options, *, as_json: bool, web: bool =
 
 
 def resume_run(path: Path, options: Mapping[str, Any], *, as_json: bool) -> None:
-    """Resume a run that ended early, and print the result; the options are those of ``Session.resume``."""
+    """Take missing or further shots of a run, and print the result; see ``Session.resume``."""
 
     def resume(observer: RunObserver | None) -> Session:
         return Session.resume(folder_of_run(path), **options, observer=observer)
 
     run_session(resume, as_json=as_json)
+
+
+def rerun_run(path: Path, options: Mapping[str, Any], *, as_json: bool) -> None:
+    """Take a run again, and print the result; the options are those of ``Session.rerun``."""
+
+    def rerun(observer: RunObserver | None) -> Session:
+        return Session.rerun(folder_of_run(path), **options, observer=observer)
+
+    run_session(rerun, as_json=as_json)
 
 
 def _observer() -> LogLines | LiveView:

@@ -1,134 +1,150 @@
-"""`labseq runs`: the runs in a data folder, from run.json, STATE and the index of each."""
+"""`labseq runs` and `labseq note`: the runs in a data folder, and what people say about them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from datetime import datetime
+from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 from labseq.console.output import say
 from labseq.console.report import Column, aligned, print_report, table
 from labseq.console.runs import folder_of_run
 from labseq.console.text import plural
-from labseq.errors import ConfigError, Problem, RecordingError
+from labseq.data.catalogue import RunEntry, runs
+from labseq.errors import ConfigError, Problem, one_of
 from labseq.messages import clean, visible
 from labseq.recording import data_root
-from labseq.recording.index import read_index
-from labseq.recording.listing import runs_in
 from labseq.recording.notes import Notes, read_notes, write_notes
-from labseq.recording.run_file import read_run, read_state
-from labseq.units import size_text
 
 
 @dataclass(frozen=True, slots=True)
-class RunRow:
-    """A run in a data folder; of a damaged one only its name and the error are known."""
+class RunQuery:
+    """Which runs are listed; see :func:`labseq.data.catalogue.runs`.
 
-    run: str
-    run_dir: Path
-    t_start_utc: str | None = None
-    sequence: str | None = None
-    profile: str | None = None
-    shots: int | None = None
-    n_shots: int | None = None
-    status: str = "damaged"
-    error: str | None = None
-    simulated: bool | None = None
-    seed: int | None = None
-    bytes: int | None = None
+    Attributes:
+        conditions: Arguments of that function.
+        sort: Name of the result or other value that they are sorted by, with "-" before it from the
+            greatest to the least; "" for the time.
+        limit: Maximum number of runs.
+    """
 
-    @classmethod
-    def of(cls, folder: Path) -> RunRow:
-        """What the files of a run say."""
-        row = cls(_id(folder), folder)
-        try:
-            record, (status, error) = read_run(folder), read_state(folder)
-            index = read_index(folder)[0]
-        except (RecordingError, OSError) as failure:
-            return replace(row, error=str(failure))
-        resolved: Any = record.get("resolved")
-        profile = resolved.get("profile") if isinstance(resolved, dict) else None
-        return replace(
-            row,
-            t_start_utc=record.get("t_start_utc"),
-            sequence=record["name"],
-            profile=profile.get("name") if isinstance(profile, dict) else None,
-            shots=len({shot.shot for shot in index if shot.counts}),
-            n_shots=record["n_shots"],
-            status=status,
-            error=error,
-            simulated=record["simulated"],
-            seed=record["seed"],
-            bytes=sum(shot.bytes for shot in index),
-        )
+    conditions: Mapping[str, Any]
+    sort: str = ""
+    limit: int = 20
 
 
-COLUMNS: Final[Sequence[Column[RunRow]]] = (
-    Column("run", lambda run: visible(run.run)),
-    Column("started", lambda run: _local_time(run.t_start_utc)),
-    Column("profile", lambda run: visible(str(run.profile or "-"))),
-    Column("shots", lambda run: "-" if run.shots is None else f"{run.shots} of {run.n_shots}", right=True),
-    Column("status", lambda run: run.status),
-    Column("hardware", lambda run: {None: "-", True: "simulated", False: "real"}[run.simulated]),
-    Column("seed", lambda run: "-" if run.seed is None else run.seed, right=True),
-    Column("size", lambda run: "-" if run.bytes is None else size_text(run.bytes), right=True),
+COLUMNS: Final[Sequence[Column[RunEntry]]] = (
+    Column("run", lambda run: visible(run.number)),
+    Column("began", lambda run: _local_time(run.t_start_utc)),
+    Column("name", lambda run: visible(run.name or run.path.name)),
+    Column(
+        "scanned", lambda run: clean("; ".join(f"{_short(a)} {v}" for a, v in run.scanned.items()) or "-")
+    ),
+    Column("measured", lambda run: clean(str(run.results[0])) if run.results else "-"),
+    Column("shots", lambda run: "-" if run.shots is None else _shots(run), right=True),
+    Column("state", lambda run: run.status),
+    Column("note", lambda run: clean(" ".join([*(f"[{tag}]" for tag in run.tags), run.note]).strip())),
 )
+
+
+def _shots(run: RunEntry) -> str:
+    return f"{run.shots} of {run.n_shots}"
+
+
+def _short(address: str) -> str:
+    """An address without what most have in common.
+
+    Example:
+        >>> _short("shot.hold.duration"), _short("profile.mobile_tweezers.speed")
+        ('hold.duration', 'mobile_tweezers.speed')
+    """
+    return re.sub(r"^(shot|profile)\.", "", address)
 
 
 @dataclass(frozen=True, slots=True)
 class RunList:
-    """The newest runs in a data folder, the newest last.
+    """The runs in a data folder that were asked for, in the order in which they are printed.
 
     Attributes:
         folder: The data folder.
-        name: Part of the names that was asked for; "" for all runs.
-        n_runs: Number of all of these runs.
-        runs: The newest of them.
+        runs: The runs.
+        has_more: Whether there are others, which the limit has left out.
     """
 
     folder: Path
-    name: str
-    n_runs: int
-    runs: tuple[RunRow, ...]
+    runs: Sequence[RunEntry]
+    has_more: bool
+
+    def as_json(self) -> dict[str, Any]:
+        """The runs with what names them."""
+        listed = [
+            {
+                "run": run.id,
+                "number": run.number,
+                **asdict(run),
+                "results": [_plain(one) for one in run.results],
+            }
+            for run in self.runs
+        ]
+        return {"folder": self.folder, "has_more": self.has_more, "runs": listed}
 
     def as_text(self) -> list[str]:
         """A row per run, and how many are damaged or not listed."""
         if not self.runs:
-            named = f" with {visible(self.name)!r} in their name" if self.name else ""
-            return [f"no runs{named} in {visible(str(self.folder))}"]
+            return [f"no such runs in {visible(str(self.folder))}"]
         lines = table(self.runs, COLUMNS)
         if n_damaged := sum(run.status == "damaged" for run in self.runs):
             lines += ["", f"{plural(n_damaged, 'run')} cannot be read: `labseq doctor` says why"]
-        if self.n_runs > len(self.runs):
-            lines += ["", f"the newest of {plural(self.n_runs, 'run')}; --limit {self.n_runs} lists all"]
-        return lines
+        return [*lines, *(["", "there are more; --limit N lists N"] if self.has_more else [])]
 
 
-def list_runs(data: Path | None, name: str, limit: int, *, as_json: bool) -> None:
-    """Print a row for each of the newest runs, the newest last.
+def _plain(result: Any) -> dict[str, Any]:
+    return {"name": result.name, **result.value.as_json(), "at": result.at}
+
+
+def list_runs(data: Path | None, query: RunQuery, *, as_json: bool) -> None:
+    """Print a row for each of the newest runs that meet the conditions, the newest last; or sorted.
 
     Raises:
-        ConfigError: There is no such folder.
+        ConfigError: There is no such folder, a condition cannot be read, or no run has the value to sort by.
     """
-    root = data_root() if data is None else data.expanduser()
-    if data is not None and not root.is_dir():
-        raise ConfigError(Problem("there is no such folder", visible(str(root)), hint="give a data folder"))
-    folders = [folder for folder in runs_in(root) if name.lower() in _id(folder).lower()]
-    runs = RunList(root, name, len(folders), tuple(map(RunRow.of, folders[-limit:])))
-    print_report(runs, as_json=as_json)
+    matching = runs(data, **query.conditions)
+    listed = sorted_by(query.sort, [*matching]) if query.sort else matching
+    newest = [*islice(listed, query.limit + 1)]
+    shown = newest[: query.limit][::-1]
+    print_report(RunList(data or data_root(), shown, len(newest) > query.limit), as_json=as_json)
 
 
-def _id(folder: Path) -> str:
-    return f"{folder.parent.name}/{folder.name}"
+def sorted_by(name: str, found: Sequence[RunEntry]) -> list[RunEntry]:
+    """The runs that have a value, the greatest first; the least first if its name begins with "-".
+
+    Raises:
+        ConfigError: None has it.
+    """
+    key, is_reversed = name.removeprefix("-"), name.startswith("-")
+    with_value = [(value, run) for run in found if _is_number(value := run.values.get(key))]
+    if found and not with_value:
+        known = sorted({name for run in found for name, value in run.values.items() if _is_number(value)})
+        raise ConfigError(
+            Problem(f"none of the runs has a value '{clean(key)}'", "--sort", expected=one_of(known))
+        )
+    return [run for _, run in sorted(with_value, key=lambda pair: pair[0], reverse=not is_reversed)]
 
 
-def _local_time(t_utc: Any) -> str:
-    """The time of day on this computer; the run's folder has the date."""
+def _is_number(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not math.isnan(value)
+
+
+def _local_time(t_utc: str) -> str:
+    """The time of day on this computer; the run's name has the date."""
     try:
         return f"{datetime.fromisoformat(t_utc).astimezone():%H:%M}"
-    except (TypeError, ValueError, OverflowError):
+    except (ValueError, OverflowError):
         return "-"
 
 

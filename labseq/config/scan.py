@@ -81,6 +81,10 @@ class Scan:
         """Number of points."""
         return math.prod(self.shape)
 
+    def allows(self, n_shots: int, *, as_option: bool) -> bool:
+        """Whether a run may have this number of shots; an option may ask for part of a scan, or for more."""
+        return as_option or n_shots == self.n_points * self.repeats
+
     @property
     def axes(self) -> tuple[Axis, ...]:
         """All axes, in the order written."""
@@ -93,19 +97,22 @@ class Scan:
             for axis in group:
                 yield axis, axis.values[position]
 
-    def points_of_shots(self, seed: int) -> NDArray[np.int32]:
-        """Number of the point of each shot, int32 (n_points * repeats,).
+    def points_of_shots(self, seed: int, n_shots: int) -> NDArray[np.int32]:
+        """Number of the point of each shot, int32 (n_shots,).
 
+        Shots beyond n_points * repeats begin the scan again, so that a run can be given more of them.
         Sequential: all shots of a point, then the next. Shuffled: round by round; each round
         takes every point once, in an order drawn from the run's seed, so that a drift of the
         machine affects all points equally, even in a run that is stopped early.
         """
         points = np.arange(self.n_points, dtype=np.int32)
         if self.order == "sequential":
-            return np.repeat(points, self.repeats)
+            n_passes = -(-n_shots // (self.n_points * self.repeats))
+            return np.tile(np.repeat(points, self.repeats), n_passes)[:n_shots]
         # A key of one part: the random numbers of shots have keys of two parts.
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x5CA4,)))
-        return np.concatenate([rng.permutation(points) for _ in range(self.repeats)])
+        n_rounds = -(-n_shots // self.n_points)
+        return np.concatenate([rng.permutation(points) for _ in range(n_rounds)])[:n_shots]
 
     def bound(self, document: Document) -> Self:
         """A copy in which the axes of the profile have their locations in the profile.
@@ -264,6 +271,11 @@ class AdaptiveScan(Scan):
         """The largest possible number of points."""
         return self.max_points
 
+    def allows(self, n_shots: int, *, as_option: bool) -> bool:
+        """The same; its scanner cannot begin again."""
+        n_most = self.n_points * self.repeats
+        return n_shots == n_most or (as_option and n_shots < n_most)
+
     @property
     def ranges(self) -> tuple[RangeAxis, ...]:
         """The axes, in the order written."""
@@ -302,10 +314,10 @@ def at_first_point(
     is_option = any(override.address == "shots" for override in overrides)
     if shots is None:
         document = document.override("shots", str(n_shots), "the scan")
-    elif type(shots) is int and (shots > n_shots if is_option else shots != n_shots):
+    elif type(shots) is int and not scan.allows(shots, as_option=is_option):
         what = f"shots is {shots}, but the scan has {scan.n_points} x {scan.repeats} = {n_shots}"
         expected = f"at most {n_shots}" if is_option else ""
-        hint = "write 'repeats' for more" if is_option else "leave 'shots' out, it follows from the scan"
+        hint = "write 'points' for more" if is_option else "leave 'shots' out, it follows from the scan"
         problems.add(document.error(("shots",), what + " (points x repeats)", expected, hint))
     return scan.at_first_point(document, profile=False), scan
 

@@ -6,13 +6,11 @@ Tables, plots, fits, exports, adaptive scans and checks all take their values fr
 from __future__ import annotations
 
 import math
-import operator
-import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from labseq.data.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, columns_of, quantities_in
+from labseq.data.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, quantities_in
 from labseq.data.shot import Shot
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, closest, did_you_mean
@@ -35,7 +33,6 @@ from labseq.recording.folders import RESULT_PREFIX
 from labseq.recording.index import IndexRow
 from labseq.recording.results import result_columns
 from labseq.recording.schema import unit_of
-from labseq.units import parse_any
 
 if TYPE_CHECKING:
     from labseq.data.reader import Run
@@ -287,67 +284,3 @@ def _check_no_load(run: Run, name: str) -> None:
         raise ConfigError(
             Problem(message, clean(run.path.name), expected="two images without a 'load' between them")
         )
-
-
-_COMPARISONS: Final[Mapping[str, Callable[[float, float], bool]]] = {
-    # a computed value and a typed one differ in their last digits
-    "==": lambda a, b: math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12),
-    "!=": lambda a, b: not math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12),
-    ">=": operator.ge,
-    "<=": operator.le,
-    ">": operator.gt,
-    "<": operator.lt,
-}
-
-
-def select_shots(run: Run, conditions: Iterable[str]) -> tuple[Shot, ...]:
-    """The shots of a run that meet every condition, such as "filling:before == 1".
-
-    Raises:
-        ConfigError: A condition cannot be read, or names neither a quantity nor a column of the run.
-    """
-    shots = tuple(run.shots)
-    for condition in conditions:
-        match = re.match(r"\s*(\S+?)\s*(==|!=|>=|<=|>|<)\s*(\S.*?)\s*\Z", condition)
-        if match is None:
-            message = f"this is not a condition: '{clean(condition)}'"
-            raise ConfigError(Problem(message, "--where", expected="for example 'filling:before == 1'"))
-        name, comparison, limit = match.groups()
-        value_of, is_text = _values_for_conditions(run, name)
-        meets = _text_condition(comparison, limit) if is_text else _number_condition(comparison, limit)
-        shots = tuple(shot for shot in shots if meets(value_of(shot)))
-    return shots
-
-
-def _values_for_conditions(run: Run, name: str) -> tuple[Callable[[Shot], Any], bool]:
-    """The values of a column of the export, or of a quantity, and whether they are text."""
-    columns = {column.name: column for column in columns_of(run)}
-    if name in columns:
-        values = columns[name].values
-        of_shot = dict(zip((shot.index for shot in run.shots), values.tolist(), strict=True))
-        return lambda shot: of_shot[shot.index], values.dtype == object
-    if parse_name(name).kind not in OF_IMAGES:
-        near = closest(name, [*columns, *OF_IMAGES])
-        raise ConfigError(
-            Problem(
-                f"there is no quantity or column '{clean(name)}'",
-                "--where",
-                expected="a quantity, such as filling:before, or a column of labseq export",
-                hint=f"did you mean '{near}'?" if near else "",
-            )
-        )
-    return find_quantity(run, name).of_shot, False
-
-
-def _number_condition(comparison: str, text: str) -> Callable[[float], bool]:
-    try:
-        limit = float(text) if re.fullmatch(r"[-+.\deE]+", text) else parse_any(text)[0]
-    except ValueError as error:
-        raise ConfigError(Problem(str(error), "--where", expected="a number, or one with a unit")) from error
-    return lambda value: _COMPARISONS[comparison](value, limit)
-
-
-def _text_condition(comparison: str, text: str) -> Callable[[str], bool]:
-    if comparison not in ("==", "!="):
-        raise ConfigError(Problem(f"'{comparison}' does not compare text", "--where", expected="== or !="))
-    return lambda value: (value == text) == (comparison == "==")

@@ -250,7 +250,7 @@ class Run:
         Raises:
             ConfigError: A condition cannot be read, or no shot meets all of them.
         """
-        from labseq.data.quantities import select_shots
+        from labseq.data.conditions import select_shots
 
         if not conditions:
             return self

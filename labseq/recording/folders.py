@@ -147,29 +147,15 @@ def find_run(path: Path) -> Path:
         RecordingError: There is no such run; the message says what to give instead.
     """
     try:
-        if not is_there(path.expanduser()):
-            from labseq.recording.listing import named_run  # a plain run does not need it
-
-            return named_run(path.as_posix(), data_root())
+        exists = is_there(path.expanduser())
     except OSError as error:
         raise RecordingError(path, f"cannot be read: {str(error.strerror or error).lower()}") from error
-    path = path.expanduser().resolve()
-    for folder in (path, path.parent, path.parent.parent):
+    place = path.expanduser().resolve()
+    for folder in (place, place.parent, place.parent.parent) if exists else ():
         if (folder / RUN_FILE).is_file():
             return folder
-    for folder in (path, path.parent, path.parent.parent):
-        if (folder / STATE_FILE).is_file():
-            raise RecordingError(folder, _without_run_file(folder))
-    runs = sorted(file.parent for depth in ("*", "*/*") for file in path.glob(f"{depth}/{RUN_FILE}"))
-    if runs:
-        content = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
-        raise RecordingError(
-            path, f"contains {content} but is not a run itself", f"give one of them, for example {runs[-1]}"
-        )
-    raise RecordingError(path, f"is not a run: it has no {RUN_FILE}", "give a run's folder")
+    from labseq.recording.listing import named_run, not_a_run  # a plain run does not need it
 
-
-def _without_run_file(folder: Path) -> str:
-    if any((folder / SHOTS_FOLDER).glob("*.h5")):
-        return f"holds shots, but its {RUN_FILE} is gone; restore that from a backup"
-    return f"has no {RUN_FILE}: the run died while its folder was made; it holds no shots, delete it"
+    if exists:
+        raise not_a_run(place)
+    return named_run(path.as_posix(), data_root())

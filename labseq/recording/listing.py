@@ -2,23 +2,44 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from labseq.errors import RecordingError
 from labseq.messages import visible
-from labseq.recording.folders import RUN_FILE
+from labseq.recording.folders import RUN_FILE, SHOTS_FOLDER, STATE_FILE
 
 
 def runs_in(root: Path) -> list[Path]:
     """The folders of runs in a data folder, damaged ones included, the newest last."""
-    run_dirs = [folder for folder in root.glob("*-*-*/*_*") if counter_of(folder) >= 0 and folder.is_dir()]
-    # by number, not by name: 10000 follows 9999
-    return sorted(run_dirs, key=lambda folder: (folder.parent.name, counter_of(folder)))
+    return [root / day / name for day, name in newest_first(root)][::-1]
 
 
-def counter_of(folder: Path) -> int:
+def newest_first(root: Path) -> Iterator[tuple[str, str]]:
+    """The same as day and name, the newest first; an older day is read when it is its turn.
+
+    As text, since ten thousand paths take longer to make than all the rest.
+    """
+    for day in sorted(_folders(root), reverse=True):
+        if day.count("-") >= 2:
+            names = [name for name in _folders(root / day) if "_" in name and counter_of(name) >= 0]
+            # by number, not by name: 10000 follows 9999
+            for name in sorted(names, key=lambda name: (counter_of(name), name), reverse=True):
+                yield day, name
+
+
+def _folders(folder: Path) -> list[str]:
+    try:
+        with os.scandir(folder) as found:
+            return [entry.name for entry in found if entry.is_dir()]
+    except OSError:  # it is gone, is a file, or may not be read
+        return []
+
+
+def counter_of(name: str) -> int:
     """The number of a run, from the name of its folder; -1 if it has none."""
-    number = folder.name.partition("_")[0]
+    number = name.partition("_")[0]
     return int(number) if number.isdecimal() else -1
 
 
@@ -34,7 +55,7 @@ def named_run(name: str, root: Path) -> Path:
     """
     day, _, last = name.rpartition("/")
     for folder in reversed(runs_in(root)):
-        is_number = last.isdecimal() and int(last) == counter_of(folder)
+        is_number = last.isdecimal() and int(last) == counter_of(folder.name)
         if day in ("", folder.parent.name) and (
             is_number or last in (folder.name, folder.name.partition("_")[2])
         ):
@@ -53,3 +74,23 @@ def newest_run(root: Path) -> Path:
     if not folders:
         raise RecordingError(root, "holds no runs", "give a run's folder, or set LABSEQ_DATA")
     return folders[-1]
+
+
+def not_a_run(path: Path) -> RecordingError:
+    """The error of a path that exists and is not part of a run, which says what to give instead."""
+    for folder in (path, path.parent, path.parent.parent):
+        if (folder / STATE_FILE).is_file():
+            return RecordingError(folder, _without_run_file(folder))
+    runs = sorted(file.parent for depth in ("*", "*/*") for file in path.glob(f"{depth}/{RUN_FILE}"))
+    if runs:
+        content = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
+        return RecordingError(
+            path, f"contains {content} but is not a run itself", f"give one of them, for example {runs[-1]}"
+        )
+    return RecordingError(path, f"is not a run: it has no {RUN_FILE}", "give a run's folder")
+
+
+def _without_run_file(folder: Path) -> str:
+    if any((folder / SHOTS_FOLDER).glob("*.h5")):
+        return f"holds shots, but its {RUN_FILE} is gone; restore that from a backup"
+    return f"has no {RUN_FILE}: the run died while its folder was made; it holds no shots, delete it"

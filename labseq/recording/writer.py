@@ -118,7 +118,8 @@ class RunWriter:
         """Resume a run that ended before its last shot; no other process may write to it.
 
         Args:
-            run: Its current record, for the files of the next shots; only ``resumed`` is written to run.json.
+            run: Its current record, for the files of the next shots; only ``resumed`` is written to run.json,
+                and what follows from the number of shots if that has grown.
             n_written: Number of shots written before that count.
             stop: The request to stop the run.
 
@@ -126,6 +127,8 @@ class RunWriter:
             RecordingError: The folder cannot be written to, the disk is full, or run.json is damaged.
         """
         before = {**read_run(run_dir), "resumed": run.resumed}
+        if run.n_shots != before["n_shots"]:
+            before |= {name: getattr(run, name) for name in ("n_shots", "scan", "overrides", "resolved")}
         with explained(run_dir):
             (run_dir / folders.STOP_FILE).unlink(missing_ok=True)
             # all files, as one may have been written without its line in the index

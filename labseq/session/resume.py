@@ -58,11 +58,15 @@ class ResumableRun:
     _lock: Lock
 
     @classmethod
-    def open(cls, path: Path) -> Self:
+    def open(cls, path: Path, shots: int | None = None) -> Self:
         """Open a run for resuming, and lock it.
 
+        Args:
+            path: The run.
+            shots: Number of shots that it is to have; None for that which it was begun with.
+
         Raises:
-            ConfigError: It is complete or in progress, or another process resumes it.
+            ConfigError: It is complete, has as many shots, is in progress, or another process resumes it.
             RecordingError: It is not a run, is damaged, has another format, or cannot be written to.
         """
         folder = find_run(path)
@@ -73,13 +77,13 @@ class ResumableRun:
         if holder is not None:
             raise _refused(folder, f"another process is already resuming it: {holder}")
         try:
-            return cls._read(folder, lock, warnings)
+            return cls._read(folder, shots, lock, warnings)
         except BaseException:
             lock.release()
             raise
 
     @classmethod
-    def _read(cls, folder: Path, lock: Lock, warnings: list[str]) -> Self:
+    def _read(cls, folder: Path, shots: int | None, lock: Lock, warnings: list[str]) -> Self:
         owner, changes = read_owner(folder), list[Change]()
         if read_state(folder)[0] == "running" and owner is not None:
             if owner.is_here:
@@ -90,9 +94,11 @@ class ResumableRun:
         LineLog(folder / INDEX_FILE)  # ends an unfinished last line: if it is whole, its shot counts
         run = open_run(folder)
         gone = [shot.index for shot in run.shots if not shot.file.is_file()]
-        if (over := is_over(run)) and not gone:
-            raise _refused(folder, over)
+        if shots is None and not gone and (over := is_over(run)):
+            raise _refused(folder, f"{over}; --shots N adds more")
         done = frozenset(shot.index for shot in run.shots).difference(gone).union(run.skipped)
+        if shots is not None and shots <= run.n_shots:
+            raise _refused(folder, f"it has {run.n_shots} shots; expected more than these with --shots")
         if gone:
             warnings.append(
                 f"the files of these shots are gone, and the shots are taken again: {_numbers(gone)}"
@@ -222,18 +228,52 @@ def _numbers(shots: list[int]) -> str:
     return first if len(shots) <= 5 else f"{first}, ... ({len(shots)} in all)"
 
 
-def reopened(path: Path, *, accept_changes: bool, realtime: bool) -> tuple[Assembly, Options, ResumableRun]:
-    """Read a run back so that it can be continued.
+def reopened(
+    path: Path, shots: int | None, *, accept_changes: bool, realtime: bool
+) -> tuple[Assembly, Options, ResumableRun]:
+    """Read a run back so that it can be continued, with ``shots`` up to that number of shots.
 
     Raises:
         ConfigError: The run cannot be resumed, or something has changed.
         RecordingError: It is not a run, is damaged, has another format, or cannot be written to.
     """
-    earlier = ResumableRun.open(path)
+    earlier = ResumableRun.open(path, shots)
     try:
         assembly, options = earlier.assemble(realtime=realtime)
         earlier.compare(assembly, options, accept=accept_changes)
+        if shots is not None:
+            options = replace(options, shots=shots)
+            assembly = assemble_recorded(files_of(earlier.run), options)
     except BaseException:
         earlier.release()
         raise
     return assembly, options, earlier
+
+
+def taken_again(path: Path, given: Options, *, same_seed: bool) -> tuple[Assembly, Options, list[str]]:
+    """Assemble a run's files for a new run, and say what differs from the earlier one.
+
+    Args:
+        path: The earlier run.
+        given: Options of the new run; all others are those of the earlier one.
+        same_seed: Whether to take its seed, too.
+
+    Raises:
+        ConfigError: That is no longer possible, for example because a plugin is missing.
+        RecordingError: The run is damaged, or its own files have been changed.
+    """
+    run = open_run(path)
+    _check(run.path)
+    options = Options.of(run.changes, realtime=given.realtime)
+    options = replace(
+        options,
+        shots=given.shots or options.shots,
+        seed=run.seed if same_seed else None,
+        output=given.output,
+        note=given.note or f"rerun of {run.path.parent.name}/{run.path.name}",
+        tags=given.tags,
+    )
+    assembly = assemble_recorded(files_of(run)._replace(calibrations=None), options)
+    today, asked_for = record_today(run, assembly, options.changes()), {"seed", "shots"}
+    changes = (change for change in changes_between(run, today) if change.what not in asked_for)
+    return assembly, options, [f"other than in {run.path.name}: {change}" for change in changes]

@@ -176,6 +176,7 @@ class Session(PreparedRun):
         options: Options,
         observer: RunObserver | None = None,
         earlier: ResumableRun | None = None,
+        warnings: Sequence[str] = (),
     ) -> None:
         before, done = (None, ()) if earlier is None else (earlier.run, earlier.done)
         root = earlier.root if earlier else options.output or data_root()
@@ -183,6 +184,7 @@ class Session(PreparedRun):
         self.options = options
         self._notes = notes_file(options.note, options.tags)
         self.earlier = earlier
+        self._warnings = warnings
         self.run_dir: Path | None = None
         # before devices are opened: some vendors' libraries change the working folder
         self._cwd, self._profile_key = Path.cwd(), assembly.hardware.key
@@ -233,17 +235,20 @@ class Session(PreparedRun):
         cls,
         run: str | Path,
         *,
+        shots: int | None = None,
         accept_changes: bool = False,
         realtime: bool = False,
         observer: RunObserver | None = None,
     ) -> Session:
-        """Read back a run that ended before its last shot, in order to take the missing shots.
+        """Read back a run in order to take its missing shots, or more shots than it was begun with.
 
         It uses the sequence, the profile, the calibrations and the options that the run began with,
         even if the files have changed. Until the session is closed, no other process can resume the run.
 
         Args:
-            run: The run's folder or any file in it.
+            run: The run's folder or any file in it, or its name or number.
+            shots: Number of shots that the run is to have, more than it was begun with; the run may be
+                complete. A scan begins again with its first point after its last shot.
             accept_changes: Whether to continue although code, plugins or settings have changed; run.json
                 records the changes.
             realtime: Let virtual time pass at the speed of real time.
@@ -256,9 +261,44 @@ class Session(PreparedRun):
         from labseq.session.resume import reopened
 
         assembly, options, earlier = reopened(
-            path_of(run, "run"), accept_changes=accept_changes, realtime=realtime
+            path_of(run, "run"), shots, accept_changes=accept_changes, realtime=realtime
         )
-        return cls(assembly, options, observer, earlier)
+        return cls(assembly, options, observer, earlier, earlier.warnings)
+
+    @classmethod
+    def rerun(
+        cls,
+        run: str | Path,
+        *,
+        same_seed: bool = False,
+        shots: int | None = None,
+        output: str | Path | None = None,
+        realtime: bool = False,
+        note: str = "",
+        tags: Sequence[str] = (),
+        observer: RunObserver | None = None,
+    ) -> Session:
+        """Prepare a new run with the sequence, the profile and the options of an earlier one.
+
+        The texts of the files are those that the earlier run began with, even if the files have changed.
+        Plugins and calibrations are those of today; what differs from the earlier run is a warning.
+
+        Args:
+            run: The earlier run: its folder or any file in it, its name or number.
+            same_seed: Whether to take its seed, too.
+            shots, output, realtime, note, tags, observer: See :meth:`open`; by default the note names the
+                earlier run.
+
+        Raises:
+            ConfigError: There is no such run, or today it would have an error.
+            RecordingError: The run is damaged, or its own files have been changed.
+        """
+        from labseq.session.resume import taken_again
+
+        folder = None if output is None else path_of(output, "output")
+        given = Options(shots=shots, output=folder, realtime=realtime, note=note, tags=tags)
+        assembly, options, warnings = taken_again(path_of(run, "run"), given, same_seed=same_seed)
+        return cls(assembly, options, observer, warnings=warnings)
 
     def __enter__(self) -> Self:
         return self
@@ -290,7 +330,7 @@ class Session(PreparedRun):
             from labseq.session.notices import Notices  # loads what other runs do not need
 
             self.observers.add(Notices.read())
-        for text in () if self.earlier is None else self.earlier.warnings:
+        for text in self._warnings:
             self.warn(text)
         reading = self._reading_code()
         hardware, purpose = self.assembly.hardware, f"a run of {self.assembly.sequence.name}"

@@ -14,10 +14,10 @@ import labseq
 from labseq.analysis.overview import map_picture, scan_picture
 from labseq.analysis.scanned import ScanRequest, scan_report
 from labseq.cli import main
+from labseq.data.conditions import select_shots
 from labseq.data.fit_models import MODELS, RB87_U
 from labseq.data.fits import fit_points
 from labseq.data.points import scan_points
-from labseq.data.quantities import select_shots
 from labseq.data.scanned import FitRequest
 from labseq.data.site_maps import site_map
 from labseq.errors import ConfigError

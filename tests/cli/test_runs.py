@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import pytest
 
 import labseq
 from labseq.console.runs import folder_of_run
+from labseq.data import catalogue
 from labseq.recording import RunWriter
 from labseq.recording.notes import Notes, write_notes
 
@@ -41,28 +44,69 @@ def data(fake: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_the_runs_of_a_folder(data: Path, call: Any) -> None:
     code, out, err = call("runs")
-    lines = [line.split("  ")[0] for line in out.splitlines()]
-    names = [f"{DAYS[0]}/{name}" for name in ("0001_compact-225", "0002_half", "0003_old", "0004_empty")]
-    names += [f"{DAYS[0]}/10000_compact-225", f"{DAYS[1]}/0001_compact-225", f"{DAYS[1]}/10000_compact-225"]
-    assert (code, err, lines[1:8]) == (0, "", names)
-    assert lines[9] == "3 runs cannot be read: `labseq doctor` says why"
-    table = {line.split()[0]: line.split() for line in out.splitlines()[1:8]}
-    assert table[names[0]][2:8] == ["-", "2", "of", "2", "complete", "simulated"]
-    assert table[names[1]][4] == "damaged"
-    assert table[names[-1]][3:7] == ["1", "of", "2", "stopped"]
+    rows = [line.split() for line in out.splitlines()]
+    names = [f"{DAYS[0]}/{n}" for n in (1, 2, 3, 4, 10_000)] + [f"{DAYS[1]}/{n}" for n in (1, 10_000)]
+    assert (code, err, [row[0] for row in rows[1:8]]) == (0, "", names)
+    assert out.splitlines()[9] == "3 runs cannot be read: `labseq doctor` says why"
+    assert rows[1][2:] == ["compact-225", "-", "filling", "100", "%", "2", "of", "2", "complete"]
+    assert rows[2][2:] == ["0002_half", "-", "-", "-", "damaged"]
 
-    code, out, _ = call("runs", "runs", "--name", "COMPACT", "--limit", "1", "--json")
+    code, out, _ = call("runs", "runs", "--search", "COMPACT stopped", "--limit", "1", "--json")
     answer = json.loads(out)
-    assert (code, answer["n_runs"]) == (0, 4)
+    assert (code, answer["has_more"]) == (0, True)
     (run,) = answer["runs"]
-    assert (run["run"], run["shots"], run["n_shots"], run["status"]) == (names[-1], 1, 2, "stopped")
-    shots = list(Path(run["run_dir"]).glob("shots/*.h5"))
+    assert (run["number"], run["shots"], run["n_shots"], run["status"]) == (names[-1], 1, 2, "stopped")
+    assert run["results"][0] == {"name": "filling", "value": 1.0, "error": None, "unit": "", "at": ""}
+    shots = list(Path(run["path"]).glob("shots/*.h5"))
     assert run["bytes"] == sum(path.stat().st_size for path in shots) > 0
-    code, out, _ = call("runs", "--limit", "2")
-    assert out.splitlines()[-1] == "the newest of 7 runs; --limit 7 lists all"
-    assert call("runs", "--name", "x") == (0, "no runs with 'x' in their name in runs\n", "")
+    assert call("runs", "--search", "x?") == (0, "no such runs in runs\n", "")
     code, _, err = call("runs", "nowhere")
     assert (code, err[:9]) == (2, "nowhere: ")
+
+
+def test_runs_are_chosen_and_sorted(data: Path, call: Any) -> None:
+    write_notes(data / DAYS[0] / "0001_compact-225", Notes.of("new lens", ["good"]))
+
+    def numbers(*options: str) -> list[str]:
+        code, out, err = call("runs", "--json", *options)
+        assert (code, err) == (0, "")
+        return [run["number"][8:] for run in json.loads(out)["runs"]]
+
+    assert numbers("--tag", "good") == numbers("--search", "LENS") == ["02/1"]
+    assert numbers("--since", DAYS[1]) == ["03/1", "03/10000"]
+    assert numbers("--until", DAYS[0], "--sequence", "compact_225", "--where", "shots < 2") == ["02/10000"]
+    assert numbers("--status", "stopped", "--sort", "shots") == ["02/10000", "03/10000"]
+    assert numbers("--sort=-shots", "--limit", "2") == ["02/10000", "03/10000"]
+    for option, message in {
+        "--sort=tau": "--sort: none of the runs has a value 'tau'; expected one of 'defect_free', 'filling'",
+        "--since=May": "since: 'May' is not a date; expected a date, for example 2026-11-20",
+        "--where=shots < 1 parsec": "--where: '1 parsec' is not a number",
+    }.items():
+        code, _, err = call("runs", option)
+        assert (code, err[: len(message)]) == (2, message)
+
+
+def test_what_is_kept_of_a_run_follows_its_files(
+    data: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path / "cache"))
+    read, reader = list[str](), catalogue.read_entry
+    monkeypatch.setattr(catalogue, "read_entry", lambda folder: read.append(folder.name) or reader(folder))
+    two_minutes_ago = time.time() - 120
+    folders = [folder for folder in data.glob("*/*") if (folder / "run.json").is_file()]
+    for path in (path for folder in folders for path in (folder / "index.jsonl", folder) if path.exists()):
+        os.utime(path, (two_minutes_ago, two_minutes_ago))
+    first = [*labseq.runs(since=DAYS[1])]
+    read.clear()
+    assert [*map(repr, labseq.runs(since=DAYS[1]))] == [*map(repr, first)]  # nan is not itself
+    assert read == []
+    write_notes(first[0].path, Notes.of("later"))
+    assert next(labseq.runs()).note == "later"
+    assert read == ["10000_compact-225"]  # and no older one
+    (cache,) = (tmp_path / "cache" / "runs").iterdir()
+    cache.write_bytes(b"damaged " * 1000)
+    assert len([*labseq.runs()]) == 7
+    assert [run.note for run in labseq.runs(where=["shots == 1"])] == ["later", ""]
 
 
 @pytest.mark.parametrize(

@@ -107,9 +107,10 @@ def test_the_first_point_is_in_the_document_and_shots_follow_from_the_scan(tmp_p
 def test_each_round_of_a_shuffled_scan_takes_every_point_once(n: int, repeats: int, seed: int) -> None:
     listed = ", ".join(f"{i + 1} ms" for i in range(n))
     scan = scan_of(f"scan: {{shot.sort.window: [{listed}]}}\nrepeats: {repeats}\norder: shuffled\n")
-    order = scan.points_of_shots(seed)
+    order = scan.points_of_shots(seed, n * repeats)
     assert np.array_equal(np.sort(order.reshape(repeats, n), axis=1), np.tile(np.arange(n), (repeats, 1)))
-    assert np.array_equal(order, scan.points_of_shots(seed))
+    # with more shots the first ones stay where they are
+    assert np.array_equal(order, scan.points_of_shots(seed, n * (repeats + 2))[: n * repeats])
 
 
 def test_no_point_of_a_shuffled_scan_comes_early_more_often_than_others() -> None:
@@ -117,7 +118,7 @@ def test_no_point_of_a_shuffled_scan_comes_early_more_often_than_others() -> Non
     scan = scan_of(
         f"scan: {{shot.sort.window: {{range: [1 ms, {n} ms, 1 ms]}}}}\nrepeats: {repeats}\norder: shuffled\n"
     )
-    position = np.argsort(scan.points_of_shots(3).reshape(repeats, n), axis=1).mean(axis=0)
+    position = np.argsort(scan.points_of_shots(3, n * repeats).reshape(repeats, n), axis=1).mean(axis=0)
     error = np.sqrt((n**2 - 1) / 12 / repeats)
     np.testing.assert_allclose(position, (n - 1) / 2, atol=4.5 * error)
 
@@ -138,7 +139,15 @@ def test_a_value_that_a_scanner_chooses_is_rounded_by_less_than_a_thousandth_of_
 
 def test_a_sequential_scan_takes_all_shots_of_a_point_before_the_next() -> None:
     scan = scan_of("scan: {shot.sort.window: [1 ms, 2 ms]}\nrepeats: 2\n")
-    assert scan.points_of_shots(1).tolist() == [0, 0, 1, 1]
+    assert scan.points_of_shots(1, 4).tolist() == [0, 0, 1, 1]
+
+
+def test_shots_beyond_a_scan_begin_it_again(tmp_path: Path) -> None:
+    scan = scan_of("scan: {shot.sort.window: [1 ms, 2 ms]}\nrepeats: 2\n")
+    assert scan.points_of_shots(1, 7).tolist() == [0, 0, 1, 1, 0, 0, 1]
+    path = tmp_path / "s.yaml"
+    path.write_text(REST + "scan: {shot.sort.window: [1 ms, 2 ms]}\n")
+    assert load_sequence(path, [Override("shots", "3", "--shots 3")])[1].shots == 3
 
 
 def test_an_option_replaces_the_scan_of_its_address_with_a_note() -> None:
@@ -199,9 +208,10 @@ def test_a_wrong_scan_is_refused_with_its_place(tmp_path: Path, text: str, messa
     assert str(problem).startswith(f"{path}:{int(line) + N_REST}:{rest}")
 
 
-def test_an_option_for_more_shots_than_the_scan_has_is_refused(tmp_path: Path) -> None:
+def test_an_option_for_more_shots_than_an_adaptive_scan_has_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "s.yaml"
-    path.write_text(REST + "scan: {shot.sort.window: [1 ms, 2 ms]}\n")
+    over = "{shot.sort.window: {from: 1 ms, to: 9 ms}}"
+    path.write_text(REST + f"scan: {{use: climb, over: {over}, maximise: success, points: 2}}\n")
     with pytest.raises(ConfigError, match=r"--shots 3: shots is 3, .* expected at most 2"):
         load_sequence(path, [Override("shots", "3", "--shots 3")])
 

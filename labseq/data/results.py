@@ -1,0 +1,89 @@
+"""The numbers that a run was taken for: the parameters that its sequence asks for, or means of quantities."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from labseq.data.best import best_point
+from labseq.data.fits import Fit, Parameter
+from labseq.data.quantities import Quantity, measured_by, measures_of, quantity_of
+from labseq.data.reader import Run
+from labseq.data.scanned import FitAt, Scanned, fits_along, request_of, scanned
+from labseq.errors import ConfigError
+from labseq.model.estimate import Estimated, Rate
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A number that a run has measured.
+
+    Attributes:
+        name: A fitted parameter, "decay", or a quantity, "survival:before,after".
+        value: Its value with error and unit.
+        at: The values of the other axes of the scan, as written; "" without any.
+    """
+
+    name: str
+    value: Parameter
+    at: str = ""
+
+    def __str__(self) -> str:
+        """Name and value, as a list of runs shows them."""
+        return f"{self.name} {self.value}" + (f" at {self.at}" if self.at else "")
+
+
+def results_of(run: Run) -> list[Result]:
+    """The results of a run, the most important first; none without shots.
+
+    Of each quantity that the run measures these are the parameters of its fits; without a fit that has
+    succeeded, the mean over all shots. Of an adaptive scan, the best mean comes first.
+
+    Raises:
+        RecordingError: The run is damaged.
+    """
+    scan, best = scanned(run), best_point(run)
+    results = (
+        []
+        if best is None
+        else [Result(f"best {best.quantity.name}", as_parameter(best.quantity, best.value))]
+    )
+    for name in measured_by(run):
+        quantity = quantity_of(run, name)
+        fits = [] if scan is None else own_fits(run, scan, quantity, scan.over(quantity))
+        fitted = [result for at in fits if (result := reported(run, quantity, at)) is not None]
+        results += fitted or [Result(name, as_parameter(quantity, quantity.over(run.shots)))]
+    return [result for result in results if not math.isnan(result.value.value)]
+
+
+def own_fits(run: Run, scan: Scanned, quantity: Quantity, means: Sequence[Estimated]) -> list[FitAt]:
+    """The fits of a quantity that the run's sequence asks for; a fit that fails is a problem in them."""
+    wanted = next((one for one in measures_of(run) if one["value"] == quantity.name and "fit" in one), None)
+    if wanted is None or not scan.axes:
+        return []
+    try:
+        return fits_along(run, scan, quantity, means, request_of(wanted))
+    except ConfigError as error:
+        problem = "; ".join(problem.what for problem in error.problems)
+        return [FitAt({}, {}, None, f"no fit {wanted['fit']}: {problem}")]
+
+
+def reported(run: Run, quantity: Quantity, at: FitAt) -> Result | None:
+    """The parameter of a fit that the run's sequence asks for, else its first; None if the fit has none."""
+    name = next((one.get("report") for one in measures_of(run) if one["value"] == quantity.name), None)
+    if at.fit is None or not (name := name or _first_free(at.fit)) or name not in at.fit.parameters:
+        return None
+    return Result(name, at.fit.parameters[name], ", ".join(at.written.values()))
+
+
+def _first_free(fit: Fit) -> str:
+    return next(iter(fit.free), "")
+
+
+def as_parameter(quantity: Quantity, mean: Estimated) -> Parameter:
+    """The mean of a quantity, as fitted parameters are given; the error of a rate is half its interval."""
+    low, high = mean.interval
+    error = (high - low) / 2 if isinstance(mean, Rate) else mean.error
+    # an error of 0 would say that the value was fixed
+    return Parameter(mean.value, error or math.nan, "%" if quantity.is_fraction else quantity.unit)
