@@ -7,13 +7,22 @@ import typer
 
 from labseq.console.options import (
     Along,
+    DataFolder,
     FitName,
     FitSettings,
     Json,
+    OfSequence,
     Plugins,
     RunFolder,
     ScanQuantities,
+    Search,
+    Since,
+    Until,
     Where,
+    WhereRuns,
+    WithStatus,
+    WithTag,
+    run_folders,
 )
 
 REPLAY_EXAMPLES = """\b
@@ -38,6 +47,76 @@ Examples:
   labseq plot --shot 3
   labseq plot --shot 3 --cycle 1 -o first_cycle.svg
 """
+
+COMPARE_EXAMPLES = """\b
+Examples:
+  labseq compare 74 75
+  labseq compare 2026-11-20/74 2026-11-27/12 --scan survival:before,after -o lifetimes.png
+"""
+TREND_EXAMPLES = """\b
+Examples:
+  labseq trend decay --sequence lifetime
+  labseq trend loading --since 2026-11-01 --tag daily -o loading.png
+"""
+PictureFile = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", metavar="FILE", help="Also draw a picture: a PNG, SVG or PDF file."),
+]
+
+
+def compare(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN...",
+            help="Folders, names or numbers of the runs.",
+            show_default=False,
+            autocompletion=run_folders,
+        ),
+    ],
+    scan: Annotated[
+        str | None,
+        typer.Option(metavar="QUANTITY", help="The quantity; default: what the first run measures."),
+    ] = None,
+    output: PictureFile = None,
+    as_json: Json = False,
+    _plugins: Plugins = None,
+) -> None:
+    """Compare runs: the measured quantity, its fits, and the settings in which they differ.
+
+    The picture shows their scans one over the other.
+    """
+    from labseq.analysis.several import compare_runs
+
+    compare_runs(runs, scan, output, as_json=as_json)
+
+
+def trend(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="A fitted parameter, a quantity or a changed setting: decay, survival:before,after.",
+            show_default=False,
+        ),
+    ],
+    data: DataFolder = None,
+    search: Search = "",
+    since: Since = "",
+    until: Until = "",
+    sequence: OfSequence = "",
+    tag: WithTag = "",
+    status: WithStatus = "",
+    where: WhereRuns = None,
+    output: PictureFile = None,
+    as_json: Json = False,
+    _plugins: Plugins = None,
+) -> None:
+    """Follow a number over the runs of a data folder; say and mark where a calibration has changed."""
+    from labseq.analysis.several import show_trend
+
+    conditions = {"since": since, "until": until, "sequence": sequence, "tag": tag, "status": status}
+    show_trend(name, data, {**conditions, "search": search, "where": where or ()}, output, as_json=as_json)
 
 
 def replay(

@@ -9,23 +9,29 @@ import typer
 from labseq import __version__
 from labseq.analysis.commands import (
     ANALYSE_EXAMPLES,
+    COMPARE_EXAMPLES,
     PLOT_EXAMPLES,
     REPLAY_EXAMPLES,
+    TREND_EXAMPLES,
     analyse,
+    compare,
     plot,
     replay,
+    trend,
 )
 from labseq.bench.commands import bench
 from labseq.calibration.commands import CALIBRATE_EXAMPLES, calibrate, calibration
 from labseq.campaigns.commands import campaign
 from labseq.console.options import (
     Along,
+    DataFolder,
     DryRun,
     FitName,
     FitSettings,
     Json,
     Keys,
     Note,
+    OfSequence,
     Output,
     Overrides,
     Plugins,
@@ -35,11 +41,17 @@ from labseq.console.options import (
     RunFolder,
     ScanQuantities,
     Scheduler,
+    Search,
     Seed,
     SequenceFile,
     Shots,
+    Since,
     Tags,
+    Until,
     Where,
+    WhereRuns,
+    WithStatus,
+    WithTag,
     Workers,
     dry_run_mode,
     profile_option,
@@ -328,40 +340,14 @@ def check(
 
 @app.command(epilog=RUNS_EXAMPLES, short_help="List the runs in a data folder.")
 def runs(
-    data: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="DATA", help="A data folder; default: LABSEQ_DATA or ./data.", show_default=False
-        ),
-    ] = None,
-    search: Annotated[
-        str,
-        typer.Option(
-            metavar="TEXT",
-            help="Only runs whose name, date, note, tags, state, profile, scanned or changed settings or "
-            "results have all these words.",
-        ),
-    ] = "",
-    since: Annotated[
-        str, typer.Option(metavar="DATE", help="Only runs of this day, 2026-11-20, or later.")
-    ] = "",
-    until: Annotated[str, typer.Option(metavar="DATE", help="Only runs of this day or earlier.")] = "",
-    sequence: Annotated[str, typer.Option(metavar="NAME", help="Only runs of this sequence.")] = "",
-    tag: Annotated[str, typer.Option(metavar="TAG", help="Only runs with this tag.")] = "",
-    status: Annotated[
-        str,
-        typer.Option(
-            metavar="STATE", help="Only runs that are running, complete, stopped, failed or damaged."
-        ),
-    ] = "",
-    where: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="CONDITION",
-            help="Only runs with a result, a changed setting or a number of shots that meets a condition: "
-            "'decay > 2 s', 'shots >= 100'; may be given several times.",
-        ),
-    ] = None,
+    data: DataFolder = None,
+    search: Search = "",
+    since: Since = "",
+    until: Until = "",
+    sequence: OfSequence = "",
+    tag: WithTag = "",
+    status: WithStatus = "",
+    where: WhereRuns = None,
     sort: Annotated[
         str,
         typer.Option(
@@ -380,16 +366,9 @@ def runs(
     """
     from labseq.cli.runs import RunQuery, list_runs
 
-    conditions = {
-        "since": since,
-        "until": until,
-        "sequence": sequence,
-        "tag": tag,
-        "status": status,
-        "search": search,
-        "where": where or (),
-    }
-    list_runs(data, RunQuery(conditions, sort, limit), as_json=as_json)
+    conditions = {"since": since, "until": until, "sequence": sequence, "tag": tag, "status": status}
+    query = RunQuery({**conditions, "search": search, "where": where or ()}, sort, limit)
+    list_runs(data, query, as_json=as_json)
 
 
 @app.command(epilog=NOTE_EXAMPLES, short_help="Write a note about a run, or tag it.")
@@ -477,6 +456,8 @@ def notify(
 
 
 app.command(epilog=PLOT_EXAMPLES, short_help="Draw a run, or one of its shots.")(plot)
+app.command(epilog=COMPARE_EXAMPLES, short_help="Compare what several runs have measured.")(compare)
+app.command(epilog=TREND_EXAMPLES, short_help="Follow a number over the runs of days or weeks.")(trend)
 app.command(epilog=REPLAY_EXAMPLES, short_help="Try another planner or detector on a run's images.")(replay)
 app.command(epilog=ANALYSE_EXAMPLES, short_help="Analyse the shots of a run.")(analyse)
 

@@ -249,3 +249,36 @@ FitSettings = Annotated[
         help="Fix a parameter of the fit (waist='0.98 um'), or free one (offset=free); may be repeated.",
     ),
 ]
+DataFolder = Annotated[
+    Path | None,
+    typer.Argument(metavar="DATA", help="A data folder; default: LABSEQ_DATA or ./data.", show_default=False),
+]
+Search = Annotated[
+    str,
+    typer.Option(
+        metavar="TEXT",
+        help="Only runs whose name, date, note, tags, state, profile, scanned or changed settings or results "
+        "have all these words.",
+    ),
+]
+Since = Annotated[str, typer.Option(metavar="DATE", help="Only runs of this day, 2026-11-20, or later.")]
+Until = Annotated[str, typer.Option(metavar="DATE", help="Only runs of this day or earlier.")]
+OfSequence = Annotated[str, typer.Option("--sequence", metavar="NAME", help="Only runs of this sequence.")]
+WithTag = Annotated[str, typer.Option("--tag", metavar="TAG", help="Only runs with this tag.")]
+WithStatus = Annotated[
+    str,
+    typer.Option(
+        "--status",
+        metavar="STATE",
+        help="Only runs that are running, complete, stopped, failed or damaged.",
+    ),
+]
+WhereRuns = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--where",
+        metavar="CONDITION",
+        help="Only runs with a result, a changed setting or a number of shots that meets a condition: "
+        "'decay > 2 s', 'shots >= 100'; may be given several times.",
+    ),
+]

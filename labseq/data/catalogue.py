@@ -23,7 +23,7 @@ from labseq.data.scanned import scanned
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.files import cache_root, data_root
 from labseq.messages import clean
-from labseq.recording.folders import INDEX_FILE, RESULTS_FOLDER
+from labseq.recording.folders import INDEX_FILE, NOTES_FILE, RESULTS_FOLDER, RUN_FILE, STATE_FILE
 from labseq.recording.listing import counter_of, newest_first
 from labseq.recording.notes import read_notes
 
@@ -49,6 +49,7 @@ class RunEntry:
         scanned: Scanned address -> its values in words: "1 ms to 20 ms, 8 values".
         changes: Settings changed by ``--set`` and other options: address -> value, as it was typed.
         settings: The same in SI units.
+        calibrations: Kind -> id of the calibrations in use.
         results: What it measured, the most important first.
         note: The note about it.
         tags: Its tags.
@@ -70,6 +71,7 @@ class RunEntry:
     scanned: Mapping[str, str] = field(default_factory=dict[str, str])
     changes: Mapping[str, str] = field(default_factory=dict[str, str])
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    calibrations: Mapping[str, str] = field(default_factory=dict[str, str])
     results: Sequence[Result] = ()
     note: str = ""
     tags: Sequence[str] = ()
@@ -149,6 +151,7 @@ def _described(entry: RunEntry) -> RunEntry:
         bytes=sum(shot.row.bytes for shot in (*run.shots, *run.attempts)),
         changes=run.changes,
         settings={address: change.get("value") for address, change in overrides.items()},
+        calibrations=run.record.get("calibrations") or {},
         **_measured(run),
     )
 
@@ -278,7 +281,7 @@ def entries(root: Path, names: Iterable[tuple[str, str]]) -> Generator[RunEntry]
 
 def _stamp(folder: str) -> str:
     """The times and sizes of what can change in a run that has ended; "" if a change is too recent."""
-    paths = [folder, f"{folder}/{INDEX_FILE}"]
+    paths = [folder, *(f"{folder}/{name}" for name in (RUN_FILE, STATE_FILE, INDEX_FILE, NOTES_FILE))]
     states = list[tuple[int, int]]()
     with suppress(OSError):  # most runs have no results of analyses
         paths += [entry.path for entry in os.scandir(f"{folder}/{RESULTS_FOLDER}")]

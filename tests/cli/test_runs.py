@@ -94,7 +94,7 @@ def test_what_is_kept_of_a_run_follows_its_files(
     monkeypatch.setattr(catalogue, "read_entry", lambda folder: read.append(folder.name) or reader(folder))
     two_minutes_ago = time.time() - 120
     folders = [folder for folder in data.glob("*/*") if (folder / "run.json").is_file()]
-    for path in (path for folder in folders for path in (folder / "index.jsonl", folder) if path.exists()):
+    for path in (path for folder in folders for path in (*folder.iterdir(), folder)):
         os.utime(path, (two_minutes_ago, two_minutes_ago))
     first = [*labseq.runs(since=DAYS[1])]
     read.clear()
