@@ -103,7 +103,10 @@ def test_a_write_that_fails_leaves_the_older_file(
     ("number", "advice"),
     [
         (errno.EDQUOT, "quota"),
-        (errno.EACCES, "has no permission to write there; .*choose another place with --output or LABSEQ_DATA"),
+        (
+            errno.EACCES,
+            "has no permission to write there; .*choose another place with --output or LABSEQ_DATA",
+        ),
         (errno.ENOTDIR, "a file is in the way"),
         (errno.EMFILE, "check the disk"),
     ],

@@ -15,10 +15,12 @@ from markdown_it import MarkdownIt
 import labseq
 from labseq.cli.app import app
 from labseq.cli.entry import arrange
+from labseq.config.document import Document
 from labseq.config.profile import ProfileSpec
 from labseq.config.sequence import SequenceSpec
 from labseq.config.yaml_nodes import compose
 from labseq.console.errors import format_config_error
+from labseq.session.notices import NoticeSettings
 from tests.session.whole_runs import timelines
 
 from .blocks import BLOCKS, COMMENT, PAGES, ROOT, Block, commands_of, inline_of
@@ -102,12 +104,15 @@ def test_every_yaml_example_is_valid(page: str, tmp_path: Path) -> None:
 
 
 def validate(block: Block, folder: Path) -> None:
-    """Open a session with an example and what it leaves out."""
+    """Open a session with an example and what it leaves out; read the file of notices."""
     for file in (ROOT / "sequences").glob("*.txt"):  # drawings that examples name
         shutil.copy(file, folder)
     write_plugins(block, folder)
     node = compose(block.text, str(block))
     keys = {*node.plain()} if node is not None else set[str]()
+    if "webhook" in keys:
+        Document.parse(block.text, str(block)).validate(NoticeSettings)
+        return
     is_sequence = keys <= {*SequenceSpec.model_fields}
     assert is_sequence or keys <= {*ProfileSpec.model_fields}, f"neither sequence nor profile: {keys}"
     sequence, profile = folder / "sequence.yaml", folder / "profile.yaml"
