@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,7 +29,7 @@ from labseq.data.follower import Follower
 from labseq.data.quantities import WITH_TARGET, Quantity, measured_by, quantity_of
 from labseq.data.scanned import scanned
 from labseq.errors import StopRequested
-from labseq.messages import clean, one_line
+from labseq.messages import clean, one_line, visible
 from labseq.model.estimate import Estimate, Estimated, mean
 from labseq.units import format_quantity
 from labseq.watchdog import watchdog_lines
@@ -57,6 +57,12 @@ class Summary:
 
     Attributes:
         run_dir: The run's folder.
+        name: Name of the sequence.
+        profile: Name of the hardware profile.
+        target: Name of the target; "" without one.
+        changes: Settings changed by ``--set`` and other options: address -> value, as it was typed.
+        note: The note about the run.
+        tags: Its tags.
         shots: Number of shots that were taken.
         skipped: Number of shots that were skipped.
         defect_free: Fraction of the shots that met the target.
@@ -83,6 +89,12 @@ class Summary:
     """
 
     run_dir: Path | None = None
+    name: str = ""
+    profile: str = ""
+    target: str = ""
+    changes: Mapping[str, str] = field(default_factory=dict[str, str])
+    note: str = ""
+    tags: Sequence[str] = ()
     shots: int = 0
     skipped: int = 0
     defect_free: float = math.nan
@@ -112,6 +124,12 @@ class Summary:
         scan = None if scanned(run) is None else scan_report(run, ScanRequest())
         return cls(
             run_dir=run.path,
+            name=run.name,
+            profile=str(((run.record.get("resolved") or {}).get("profile") or {}).get("name") or ""),
+            target="" if run.target.is_none else run.target.name,
+            changes=run.changes,
+            note=run.note,
+            tags=run.tags,
             shots=len(run.shots),
             skipped=len(run.skipped),
             defect_free=run.defect_free,
@@ -163,6 +181,7 @@ class Summary:
         damaged = f"{plural(self.n_damaged_lines, 'line')} of the index cannot be read"
         return [
             ("run", str(self.run_dir)),
+            *self._about(),
             ("status", f"failed: {self.error}" if self.error and self.status == "failed" else self.status),
             ("shots", f"{self.shots} of {self.n_shots}{skipped}{kept}"),
             *([("ended early", clean(self.ended_early))] if self.ended_early else []),
@@ -176,6 +195,17 @@ class Summary:
             *(("resumed", line) for line in self.resumed),
             *([("warning", damaged)] if self.n_damaged_lines else []),
         ]
+
+    def _about(self) -> Facts:
+        """What the run was: files, changed settings, note and tags."""
+        on, to = f" on {self.profile}" if self.profile else "", f", to {self.target}" if self.target else ""
+        rows = {
+            "sequence": f"{self.name}{on}{to}",
+            "changed": ", ".join(f"{address}={value}" for address, value in self.changes.items()),
+            "note": self.note,
+            "tags": ", ".join(self.tags),
+        }
+        return [(name, visible(text)) for name, text in rows.items() if text]
 
 
 def _best_rows(best: BestPoint | None) -> Facts:

@@ -159,8 +159,9 @@ def test_for_people(perform: Any) -> None:
     session, out, err, _ = perform(as_json=False)
     assert err == ""
     lines = out.splitlines()
-    assert lines[-8:] == [
+    assert lines[-9:] == [
         f"run               {session.run_dir}",
+        "sequence          compact-225, to compact",
         "status            complete",
         "shots             2 of 2",
         "defect-free       1 of 2 (50.0 %), 21.6 to 78.4 %",
