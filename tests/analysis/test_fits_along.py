@@ -74,7 +74,7 @@ def test_along_chooses_the_axis_and_a_failed_fit_leaves_the_others(two: labseq.R
     fits = two.fits(SURVIVAL, "exponential", where=one_left)
     bad, good = sorted(fits, key=lambda at: at.values[VACUUM])
     assert bad.fit is None
-    assert bad.problem.startswith("1 points are too few")
+    assert bad.problem.startswith("1 point is too few")
     assert good.fit is not None
     assert math.isfinite(good.fit.reduced_chi_square)
     request = ScanRequest((SURVIVAL,), FitRequest("exponential", {}))

@@ -195,6 +195,7 @@ def test_maps_of_sites_add_up_to_the_quantity(lifetime: labseq.Run, tmp_path: Pa
     name = "survival:before,after@0:10,:"
     sites = site_map(lifetime, name)
     rate = lifetime.quantity(name).over(lifetime.shots)
+    assert isinstance(rate, Rate)
     assert (sites.n.sum(), sites.n_trials.sum()) == (rate.n, rate.n_trials)
     before, after = (np.array([shot.occupancies[i] for shot in lifetime.shots]) for i in (0, -1))
     assert sites.n_trials[:10] == pytest.approx(before.sum(axis=0)[:10])

@@ -95,8 +95,8 @@ def test_safe_changes_no_sequence(call: Any) -> None:
 @pytest.mark.parametrize(
     ("path", "said"),
     [
-        ("nope", "nope: there is no such folder, and no run of this name"),
-        ("x" * 5000, "xxx...: the folder cannot be"),
+        ("nope", "nope: no such file or folder, and no run of this name"),
+        ("x" * 5000, "xxx: cannot be read: file name too long"),
     ],
 )
 def test_a_run_that_does_not_exist_is_a_mistake_of_the_user(path: str, said: str, call: Any) -> None:

@@ -78,4 +78,4 @@ def test_findings_as_json(run_dir: Path, call: Any) -> None:
 def test_a_folder_that_does_not_exist_is_a_mistake(tmp_path: Path, call: Any) -> None:
     code, _, err = call("doctor", str(tmp_path / "no"))
     assert code == 2
-    assert "there is no such folder, and no run of this name or number in" in err
+    assert "no such file or folder, and no run of this name or number in" in err

@@ -23,8 +23,8 @@ from labseq.data import open_run
 from labseq.errors import LabseqError
 from labseq.model import SiteGrid
 from labseq.plans.plan_file import parse_plan
+from labseq.queue.listing import list_entries
 from labseq.queue.queue import Entry, Queue
-from labseq.queue.running import list_entries
 from labseq.recording.doctor import examine
 from labseq.recording.shot_file import read_content, read_frames, read_occupancies
 from labseq.testing.fakes import fake_calibration
