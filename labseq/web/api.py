@@ -18,8 +18,10 @@ import labseq
 from labseq.analysis.statistics import statistics_of
 from labseq.analysis.timing import StageTotals
 from labseq.console.events import scanned_names, scanned_values
+from labseq.data.site_maps import site_map
 from labseq.errors import RecordingError
 from labseq.files import read_file
+from labseq.model.estimate import Rate
 from labseq.plain import to_plain
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import read_state
@@ -27,6 +29,7 @@ from labseq.web.endpoint import Endpoint, describe, in_thread
 from labseq.web.history import Columns
 from labseq.web.live import MAX_VIEWERS, Live
 from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
+from labseq.web.scan import map_choices
 from labseq.web.series import finite
 from labseq.web.shots import frame_png, readings_of, shot_values
 from labseq.web.state import N_BINS, Limits, figures_of, head_of, losses_of, stage_rows
@@ -65,6 +68,7 @@ class Api:
             Endpoint(f"{_RUN}/state", self.state),
             Endpoint(f"{_RUN}/statistics", self.statistics),
             Endpoint(f"{_RUN}/scan", self.scan, ("quantity",)),
+            Endpoint(f"{_RUN}/map", self.map, ("quantity",)),
             Endpoint(f"{_RUN}/shots", self.shots, ("first", "n")),
             Endpoint(f"{_RUN}/shots/{{shot}}", self.shot, ("attempt",)),
             Endpoint(
@@ -168,6 +172,29 @@ class Api:
         """
         run = self._opened(request)
         return self._live.state_of(run).scan(_quantity(request), most_s=8.0)
+
+    def map(self, request: Request) -> Any:
+        """A quantity at each site, from at most 500 shots evenly chosen: what is measured, or `quantity`.
+
+        `values` and `n_trials` have a row for each row of sites; a value from fewer than 5 trials is null.
+        """
+        run = self._opened(request)
+        run.history.update()
+        choices = map_choices(run)
+        name = _quantity(request) or next(iter(choices), "")
+        counted = run.history.columns().counted.tolist()
+        some = run.some(_evenly(counted, 500))
+        found = site_map(some, name)
+        rate = Rate(int(found.n.sum()), int(found.n_trials.sum()))
+        return {
+            "quantity": text_of(name, 200),
+            "choices": [text_of(choice, 200) for choice in choices],
+            "values": [[finite(value) for value in row] for row in found.values.tolist()],
+            "n_trials": found.n_trials.tolist(),
+            "mean": finite(rate.value),
+            "n_read": found.n_shots,
+            "n_shots": len(counted),
+        }
 
     def shots(self, request: Request) -> Any:
         """The shots of a run, the newest first, with attempts that do not count."""

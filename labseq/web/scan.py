@@ -14,6 +14,7 @@ from labseq.data.scanned import Scanned, scanned
 from labseq.data.series import Series
 from labseq.errors import LabseqError
 from labseq.model.estimate import Estimated
+from labseq.model.image_quantities import OF_IMAGES, parse_name
 from labseq.recording.run_file import SCANNER
 from labseq.web.fitting import LiveFit, points_to_fit
 from labseq.web.runs import OpenRun, text_of
@@ -140,9 +141,20 @@ def _first_shots(run: OpenRun) -> Any:
 def _choices(run: OpenRun) -> list[str]:
     """The quantities that the page offers: shown ones, survival between images, columns, results."""
     first = _first_shots(run)
-    pairs = itertools.combinations(image_names(first), 2)
-    survival = (f"survival:{before},{after}" for before, after in pairs)
-    return [*dict.fromkeys((*run.shown, *survival, *column_names(first)))]
+    return [*dict.fromkeys((*run.shown, *_survivals(first), *column_names(first)))]
+
+
+def map_choices(run: OpenRun) -> list[str]:
+    """The quantities that have a value at each site: shown ones, survival, loading, filling."""
+    first = _first_shots(run)
+    of_images = [name for name in run.shown if parse_name(name).kind in OF_IMAGES]
+    filling = [] if run.target.is_none else [f"filling:{image}" for image in image_names(first)]
+    return [*dict.fromkeys((*of_images, *_survivals(first), "loading", *filling))]
+
+
+def _survivals(run: Any) -> list[str]:
+    pairs = itertools.combinations(image_names(run), 2)
+    return [f"survival:{before},{after}" for before, after in pairs]
 
 
 def _axis(scan: Scanned, index: int) -> dict[str, Any]:

@@ -190,3 +190,17 @@ def test_a_run_of_the_shipped_lifetime_sequence_has_its_decay(tmp_path: Path) ->
     assert fitted_at.fit is not None
     decay = answer["quantities"][0]["fit"]["parameters"]["decay"]
     assert decay["value"] == pytest.approx(fitted_at.fit.parameters["decay"].value)
+
+
+def test_a_map_has_the_quantity_at_each_site(tmp_path: Path) -> None:
+    writer = scan_of_holds(tmp_path)
+    path = path_of(writer.run_dir)
+    client = client_of(tmp_path)
+    shown = client.get(f"{path}/map").json()
+    assert shown["quantity"] == SURVIVAL == shown["choices"][0]
+    survived = np.array([shot.occupancies[1] for shot in open_run(writer.run_dir).shots]).mean(axis=0)
+    assert np.array(shown["values"]) == pytest.approx(survived)
+    assert (np.array(shown["n_trials"]) == len(HELD_S)).all()
+    for choice in shown["choices"]:
+        assert client.get(f"{path}/map?quantity={quote(choice)}").status_code == 200, choice
+    assert client.get(f"{path}/map?quantity=n_batches").status_code == 409

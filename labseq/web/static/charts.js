@@ -173,3 +173,13 @@ export function heatMap(axes, cells, label, format) {
     el("table.heat", {}, el("caption", {}, `${axes[0].address} down, ${axes[1].address} across`),
       el("thead", {}, el("tr", {}, el("td", {}, ""), axes[1].words.map((word) => el("th", { scope: "col" }, word)))), el("tbody", {}, body)));
 }
+
+// A quantity at each site: at: positions of the sites in row order, [x, y]; values: null where there are too few atoms
+export function siteMap(at, values, text, label) {
+  const known = values.filter((value) => value !== null), low = Math.min(...known), high = Math.max(...known);
+  const xs = at.map((p) => p[0]), ys = at.map((p) => p[1]), left = Math.min(...xs) - 1, top = Math.min(...ys) - 1;
+  const box = [left, top, Math.max(...xs) - left + 1, Math.max(...ys) - top + 1];
+  const step = (value) => value === null ? "none" : high > low ? Math.round(8 * (value - low) / (high - low)) : 4;
+  return svg("svg", { viewBox: box.join(" "), class: "sites", role: "img", "aria-label": label }, ...at.map(([cx, cy], i) =>
+    svg("circle", { cx, cy, r: 0.46, class: `site-${step(values[i])}` }, svg("title", {}, text(i)))));
+}

@@ -1,6 +1,7 @@
 // The list of runs, one run, and two runs side by side.
 import { go, server } from "./app.js";
-import { bars } from "./charts.js";
+import { positions } from "./array.js";
+import { bars, siteMap } from "./charts.js";
 import { count, el, facts, failure, getJson, localTime, panel, patch, percent, percentWithError, post, replace, runLink, runPath, statusPill, table, time, withError } from "./dom.js";
 import { drawTrend, isOfTarget, meanText, titleOf, valueText } from "./measured.js";
 import { headOf, stageTable, tilesOf } from "./page_now.js";
@@ -54,18 +55,19 @@ export async function showRun(main, [day, name]) {
   const id = `${day}/${name}`, values = await getJson(`/runs/${runPath(id)}`);
   const { run } = values;
   document.title = `${run.name} · labseq`;
-  const tiles = el("div.tiles"), trends = values.measured.filter((one) => one.trend.length).map((one) => [one, el("div.chart")]), more = el("div.grid"), shots = el("div"), scan = el("div.grid");
+  const tiles = el("div.tiles"), trends = values.measured.filter((one) => one.trend.length).map((one) => [one, el("div.chart")]), more = el("div.grid"), shots = el("div"), map = el("div"), scan = el("div.grid");
   replace(main, el("div.run-head", {}, headOf(run, {}), el("div.links", {}, run.status === "running" ? el("a", { href: `/now?run=${encodeURIComponent(id)}` }, "watch it") : null,
     values.has_scan ? el("a", { href: `/scan?run=${encodeURIComponent(id)}` }, "its scan") : null, values.files.map((kind) => el("a", { href: `/api/v1/runs/${runPath(id)}/files/${kind}` }, kind)), el("a", { href: `/api/v1/runs/${runPath(id)}` }, "as JSON"))),
     run.error ? el("div.alarm.is-error", {}, el("strong", {}, run.status), el("span", {}, run.error)) : null,
     values.n_damaged_lines ? el("div.alarm.is-warning", {}, el("strong", {}, `${count(values.n_damaged_lines, "line")} of the index cannot be read`)) : null,
     tiles, scan, el("div.grid", {}, trends.map(([one, box]) => panel(titleOf(one), { class: "half" }, box))), more,
-    el("div.grid", {}, panel("Shots", { class: "wide" }, shots), panel("Changed by the command line", { class: "half" }, orNone(values.changes)), notesPanel(run),
+    el("div.grid", {}, panel("Shots", { class: "wide" }, shots), panel("Map of the sites", { class: "half" }, map), panel("Changed by the command line", { class: "half" }, orNone(values.changes)), notesPanel(run),
       panel("Calibrations", { class: "half" }, orNone(values.calibrations)), panel("Devices", { class: "half" }, Object.entries(values.devices).map(([device, about]) => el("details", {}, el("summary", {}, device, about.model ? `: ${about.model}` : ""), typeof about === "object" ? facts(about) : about))),
       panel("Where it came from", { class: "wide" }, el("details", {}, el("summary", {}, `labseq ${values.provenance.labseq ?? "?"} on ${values.provenance.host ?? "?"}`), facts({ ...values.provenance, plugins: values.plugins.map((one) => `${one.name} ${one.version}`).join(", ") })))));
   patch(tiles, tilesOf(run, values.figures, values.measured, null));
   for (const [one, box] of trends) drawTrend(box, one);
   fillLater(id, values, more, scan, tiles);
+  mapOfSites(map, run);
   await shotTable(shots, id);
 }
 
@@ -82,6 +84,18 @@ async function fillLater(id, values, more, scan, tiles) {
       values.losses.length ? panel("Losses by cause", { class: "half" }, bars(values.losses.map((one) => ({ name: one.cause, value: one.mean, text: withError(one.mean, one.error ?? 0) })), "Atoms lost in a shot")) : null,
       panel("Stages", { class: "half" }, stageTable(stages, values.run.simulated)));
   } catch (error) { replace(more, failure(error)); }
+}
+
+async function mapOfSites(box, run, quantity = "") {
+  try {
+    const found = await getJson(`/runs/${runPath(run.id)}/map?${new URLSearchParams({ quantity })}`), { cols } = run.lattice;
+    const values = found.values.flat(), trials = found.n_trials.flat(), known = values.filter((value) => value !== null);
+    const text = (i) => `site (${Math.floor(i / cols)}, ${i % cols}): ${values[i] === null ? "too few" : percent(values[i])} of ${trials[i]}`;
+    const range = known.length ? `from ${percent(Math.min(...known))} (yellow) to ${percent(Math.max(...known))} (blue), mean ${percent(found.mean)}` : "no site has 5 trials yet";
+    replace(box, el("label", {}, "Quantity ", el("select", { "aria-label": "Quantity of the map", onchange: (event) => mapOfSites(box, run, event.target.value) },
+      found.choices.map((name) => el("option", { value: name, selected: name === found.quantity }, name)))),
+    siteMap(positions(run.lattice), values, text, `Map of ${found.quantity}`), el("p.note", {}, `${range}; ${count(found.n_read, "shot")} read of ${found.n_shots}`));
+  } catch (error) { replace(box, failure(error)); }
 }
 
 function orNone(values) { return Object.keys(values).length ? facts(values) : el("p.hint", {}, "none"); }
