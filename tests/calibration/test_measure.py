@@ -172,7 +172,7 @@ def test_sites_of_an_irregular_array_come_from_a_file(lab: Any) -> None:
     [
         ("sites", "outside.npy", "outside of the frame of 160 x 176 pixels"),
         ("thresholds", "outside.npy", "a calibration of thresholds cannot be made from a file"),
-        ("sites", "none", "none: there is no such folder, and no run of this name"),
+        ("sites", "none", "none: no such file or folder, and no run of this name"),
     ],
 )
 def test_a_source_with_an_error_is_refused(lab: Any, kind: str, name: str, message: str) -> None:

@@ -92,7 +92,7 @@ def test_an_analysis_that_fails(store: Store, capsys: pytest.CaptureFixture[str]
             ("site",),
             "'site' cannot be calibrated; expected one of sites, thresholds, ",
         ),
-        (("sites", "--from", "nowhere"), "nowhere: there is no such folder, and no run of this name"),
+        (("sites", "--from", "nowhere"), "nowhere: no such file or folder, and no run of this name"),
         (("sites", "--shots", "0"), "--shots 0: shots is 0; expected at least 1"),
         (("sites", "--centre", "12"), "--centre: '12'; expected Y,X: two numbers of pixels"),
         (("overlay", "--centre", "1,2"), "--centre: a calibration of overlay has no centre; expected sites"),

@@ -15,7 +15,7 @@ RANDOM = "random:20x20@0.75"
 COMPACT = ("--target", "{pattern: compact, rows: 15, cols: 15}")
 
 BAD = [
-    (["nowhere.npy", *COMPACT], "nowhere.npy: there is no such file; expected a .npy file, a text file"),
+    (["nowhere.npy", *COMPACT], "nowhere.npy: there is no such file; expected a text file of 0 and 1"),
     (["complex.npy", *COMPACT], "complex.npy: it holds an array of shape (2, 2) and type complex128"),
     (["ragged.txt", *COMPACT], "ragged.txt:2:3: this row has 2 sites; expected 3, as in line 1"),
     (
