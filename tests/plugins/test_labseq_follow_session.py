@@ -129,9 +129,9 @@ def test_a_go_that_never_comes_ends_the_run_in_the_safe_state(tmp_path: Path) ->
             session.run()
         assert caught.value.exit_code == 3
         assert session.run_dir is not None
-        assert [e["values"]["ok"] for e in events(session.run_dir) if e["event"] == "safe_state"] == [
-            True
-        ] * 5
+        made_safe = [e["values"]["ok"] for e in events(session.run_dir) if e["event"] == "safe_state"]
+        # camera, both tweezers and lines; leader, shutter and synthesizer
+        assert made_safe == [True] * 7
 
 
 def test_a_dry_run_needs_no_leader_and_no_time(tmp_path: Path) -> None:
