@@ -188,7 +188,8 @@ class Lock:
         """Take the lock if it is free.
 
         Args:
-            warn: Told if the folder, perhaps on a network, has no locks; without it that is an error.
+            warn: Receives a message if the folder, perhaps on a network, has no locks; without `warn` that is
+                an error.
 
         Returns:
             None, or the holder if it is not free.

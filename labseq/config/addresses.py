@@ -153,7 +153,7 @@ def _keys_of_part(node: Node, part: str) -> Loc:
         return (int(part),) if len(part) < 6 and int(part) < len(node.value) else ()
     for i, item in enumerate(node.value):
         if _item_name(item) == part and isinstance(item.value, dict):
-            # a step is a mapping of its kind and its name; the address goes on in the settings of the kind
+            # a step is a mapping of its kind and its name; the rest of the address is in the kind's settings
             kinds = [key for key in item.value if key != "name"]
             return (i, kinds[0]) if len(kinds) == 1 else (i,)
     return ()

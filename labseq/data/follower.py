@@ -101,7 +101,7 @@ class Follower:
                 yield Event(str(line.get("t_utc", "")), self._logged_s, name, values)
 
     def events(self) -> Generator[Event]:
-        """What the run's own observer was told since the last call.
+        """The events that the run's own observer has received since the last call.
 
         What the log leaves out (``UNLOGGED_EVENTS`` and ``UNLOGGED_VALUES`` in ``recording/folders.py``)
         is read from the run's other files.

@@ -79,8 +79,8 @@ class ClockJumps:
 
     Args:
         wall_s: The computer's clock, which a user or a network may set.
-        monotonic_s: A clock that nobody sets, and that stops while the computer sleeps.
-        boot_s: The same, but it goes on while the computer sleeps.
+        monotonic_s: A clock that cannot be set, and that stops while the computer sleeps.
+        boot_s: A clock that cannot be set, and that runs while the computer sleeps.
     """
 
     def __init__(

@@ -107,7 +107,7 @@ class AnalysisProcesses(Analyses):
 
     def finish(self) -> None:
         """After the run: give each analysis time for the remaining shots, then report missing results."""
-        # all are told first, so that they work through their last shots at the same time
+        # first ask all of them to end, so that they work through their last shots at the same time
         for process in self._processes.values():
             process.end_of_run()
         end_s = time.monotonic()

@@ -160,7 +160,7 @@ class ResumableRun:
 
         Args:
             record: The current record of the run.
-            code: The code that it goes on with.
+            code: The present code, which takes the remaining shots.
             first_shot: The first shot that is taken; None if none is.
             stop: The request to stop the run.
 

@@ -334,7 +334,7 @@ class VirtualSimulation(Simulation):
         self._lost["push_out"] += self._qubits.play(program, t_start_s, self._drive(), self._atoms)
 
     def _was_cooled(self, start_s: float, end_s: float) -> bool:
-        """Whether cooling light that lines switch was on, which prepares the atoms anew."""
+        """Whether cooling light that lines switch was on, which prepares the atoms again."""
         return bool(self._settings.lights.cooling) and self._lights.fraction_on("cooling", start_s, end_s) > 0
 
     def _drive(self) -> Mapping[str, float]:

@@ -212,7 +212,7 @@ def lose_folder(run_dir: Path) -> None:
     shutil.rmtree(run_dir / "shots")
 
 
-def mend_folder(run_dir: Path) -> None:
+def restore_folder(run_dir: Path) -> None:
     (run_dir / "shots").mkdir(exist_ok=True)
 
 
@@ -236,11 +236,11 @@ def test_a_run_that_fails_is_resumed_once_if_its_entry_says_so(queue: Queue) -> 
                 lose_folder(tried[0])
             elif name == "run_starting":
                 tried.append(Path(values["run_dir"]))
-                mend_folder(tried[-1])
+                restore_folder(tried[-1])
 
     def take(opening: Opening) -> None:
         if tried:
-            mend_folder(tried[0])
+            restore_folder(tried[0])
         with opening(Losing()) as session:
             session.run()
 
