@@ -20,7 +20,7 @@ from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import make_folder, read_file, whole_file
 from labseq.messages import visible
 from labseq.model import CalibrationEntry, CalibrationKind, SiteGrid, grid_facts, same_grid
-from labseq.plain import now_utc, parse_object
+from labseq.plain import now, now_utc, parse_object
 from labseq.units import format_quantity
 
 FORMAT: Final = "labseq-calibration"
@@ -42,6 +42,13 @@ def stem_of(entry: CalibrationEntry) -> str:
     """
     taken = datetime.fromisoformat(entry.taken_utc).astimezone(UTC)
     return f"{entry.kind}-{taken:%Y%m%dT%H%M%SZ}-{entry.id}"
+
+
+def age_s(entry: CalibrationEntry) -> float | None:
+    """Time since a calibration was made, in seconds; None if this computer's clock is behind that time."""
+    age_s = (now() - datetime.fromisoformat(entry.taken_utc)).total_seconds()
+    # the clocks of two computers may differ by a minute
+    return None if age_s < -60.0 else max(0.0, age_s)
 
 
 def encode_entry(entry: CalibrationEntry) -> bytes:

@@ -86,7 +86,7 @@ def compare(
 
     The picture shows their scans one over the other.
     """
-    from labseq.analysis.several import compare_runs
+    from labseq.analysis.comparison import compare_runs
 
     compare_runs(runs, scan, output, as_json=as_json)
 
@@ -113,7 +113,7 @@ def trend(
     _plugins: Plugins = None,
 ) -> None:
     """Follow a number over the runs of a data folder; say and mark where a calibration has changed."""
-    from labseq.analysis.several import show_trend
+    from labseq.analysis.comparison import show_trend
 
     conditions = {"since": since, "until": until, "sequence": sequence, "tag": tag, "status": status}
     show_trend(name, data, {**conditions, "search": search, "where": where or ()}, output, as_json=as_json)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +17,9 @@ import numpy as np
 from labseq.analysis.charts import COLOURS, draw_curves, points_of
 from labseq.analysis.overview import RunPicture
 from labseq.analysis.scanned import shown_unit, title_of, value_text
-from labseq.console.report import aligned
+from labseq.console.output import say
+from labseq.console.report import aligned, filled_columns, print_report
+from labseq.console.runs import chosen_run
 from labseq.console.text import plural
 from labseq.data import Run
 from labseq.data.catalogue import RunEntry, read_entry, runs
@@ -27,6 +30,7 @@ from labseq.data.scanned import Axis, is_geometric, scanned
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean
 from labseq.model.estimate import Estimate, Estimated
+from labseq.pictures.figures import check_place
 from labseq.units import factor_of
 
 if TYPE_CHECKING:
@@ -133,8 +137,7 @@ class Comparison:
                     clean(run.entry.note),
                 )
             )
-        kept = [i for i, column in enumerate(zip(*rows, strict=True)) if {*column[1:]} - {"", "-"}]
-        return aligned([[row[i] for i in kept] for row in rows])
+        return aligned(filled_columns(rows))
 
     def picture(self) -> RunPicture:
         """The scans of the runs, one over the other, with their fits; without scans, the means side by side.
@@ -275,8 +278,7 @@ class Trend:
             calibrations, note = ", ".join(point.new_calibrations), clean(point.entry.note)
             began = f"{point.began:%Y-%m-%d %H:%M}"
             rows.append((point.entry.number, began, _text(point.value), calibrations, note))
-        kept = [i for i, column in enumerate(zip(*rows, strict=True)) if {*column[1:]} - {""}]
-        return aligned([[row[i] for i in kept] for row in rows])
+        return aligned(filled_columns(rows))
 
     def picture(self) -> RunPicture:
         """The number against the time, with a line where a calibration has changed."""
@@ -320,3 +322,25 @@ def _number(entry: RunEntry, name: str) -> Parameter | None:
 
 def _text(value: Parameter) -> str:
     return str(value).removesuffix(" (fixed)")
+
+
+def compare_runs(paths: Sequence[Path], name: str | None, output: Path | None, *, as_json: bool) -> None:
+    """Print runs beside one another, and draw their scans one over the other."""
+    comparison = Comparison.of([chosen_run(path) for path in paths], name)
+    _print_and_draw(comparison, output, as_json=as_json)
+
+
+def show_trend(
+    name: str, data: Path | None, conditions: Mapping[str, Any], output: Path | None, *, as_json: bool
+) -> None:
+    """Print a number of many runs, and draw it over the time."""
+    _print_and_draw(Trend.of(name, data, conditions), output, as_json=as_json)
+
+
+def _print_and_draw(report: Comparison | Trend, output: Path | None, *, as_json: bool) -> None:
+    if output is not None:
+        check_place(output)
+    print_report(report, as_json=as_json)
+    if output is not None:
+        report.picture().save(output)
+        say(f"written: {output}", stream=sys.stderr)

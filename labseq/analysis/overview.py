@@ -396,7 +396,7 @@ def _map_panels(run: Run, sites: SiteMap) -> Row:
     n_trials = sites.n_trials[sites.n_trials > 0]
     unit = "atom" if parse_name(sites.name).kind == "survival" else "shot"
     each = f"{n_trials.min()}" if np.ptp(n_trials) == 0 else f"{n_trials.min()} to {n_trials.max()}"
-    share = f"{100 * sites.n.sum() / n_trials.sum():.1f} %"
+    share = f"{100 * sites.mean:.1f} %"
     site: dict[str, Any] = {"grid": grid_of(run), "outlined": run.target.fill}
     return (
         partial(

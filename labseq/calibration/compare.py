@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Final
 
 import numpy as np
@@ -13,7 +12,6 @@ import numpy as np
 from labseq.calibration_store import DECIDING
 from labseq.errors import ConfigError, Problem
 from labseq.model import CalibrationEntry, CalibrationKind
-from labseq.plain import now
 from labseq.recording.schema import unit_of
 from labseq.units import format_quantity
 
@@ -85,13 +83,6 @@ def _of_values(
 def _of_figure(name: str, before: float, after: float) -> Difference:
     change = after - before
     return Difference(name, unit_of(name), before, after, abs(change), abs(change), (change,))
-
-
-def age_s(entry: CalibrationEntry) -> float | None:
-    """Time since a calibration was made, in seconds; None if this computer's clock is behind that time."""
-    age_s = (now() - datetime.fromisoformat(entry.taken_utc)).total_seconds()
-    # the clocks of two computers may differ by a minute
-    return None if age_s < -60.0 else max(0.0, age_s)
 
 
 def quantity(value: float | None, name: str) -> str:

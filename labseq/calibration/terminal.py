@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from labseq.assembly.calibrations import open_store
 from labseq.assembly.options import DryRun
-from labseq.calibration.compare import Difference, age_s, compare, quality_text, quantity
+from labseq.calibration.compare import Difference, compare, quality_text, quantity
 from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
-from labseq.calibration_store import Damaged, Store, Stored, grid_text
+from labseq.calibration_store import Damaged, Store, Stored, age_s, grid_text
 from labseq.config.profile import OFF, CalibrationChoices
 from labseq.console.errors import lines_of
 from labseq.console.events import LASTING, LogLines

@@ -12,7 +12,8 @@ from typing import Any, Final, cast
 from labseq.assembly.assemble import Assembly
 from labseq.assembly.options import DryRun
 from labseq.assembly.search import Search
-from labseq.calibration.compare import age_s, quality_text
+from labseq.calibration.compare import quality_text
+from labseq.calibration_store import age_s
 from labseq.config.scan import Axis
 from labseq.config.sequence import CheckSettings
 from labseq.console.errors import warning_lines

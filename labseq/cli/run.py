@@ -115,9 +115,7 @@ def try_notice(text: str) -> None:
     if settings is None:
         expected = "a file with 'labseq: 1' and 'command' or 'webhook'"
         raise ConfigError(Problem("there is no such file", visible(str(path)), expected=expected))
-    notice = {"kind": "test", "run": "", "text": f"labseq: {text}"}
-    task = {"command": settings.command, "webhook": settings.webhook, "notice": notice}
-    if failures := send(task):
+    if failures := send(settings.task("test", "", text)):
         raise ConfigError([Problem(failure, visible(str(path))) for failure in failures])
     say(f"sent to {listing([*settings.command[:1], *([settings.webhook] if settings.webhook else [])])}")
 

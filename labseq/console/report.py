@@ -126,6 +126,17 @@ def aligned(rows: Sequence[Sequence[str]], right: Sequence[int] = (), most: int 
     return [*lines, "", *others]
 
 
+def filled_columns(rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    """Rows of text, the header first, without the columns in which no cell below the header has a value.
+
+    Example:
+        >>> filled_columns([["run", "note"], ["7", ""], ["8", "-"]])
+        [['run'], ['7'], ['8']]
+    """
+    kept = [i for i, column in enumerate(zip(*rows, strict=True)) if {*column[1:]} - {"", "-"}]
+    return [[row[i] for i in kept] for row in rows]
+
+
 _MIN_WIDTH: Final = 10
 _UNIT: Final = re.compile(r"(?<=[\d)]) (?=(?:%|[munk]?s|[munk]?m|[kMG]?Hz|[munk]?[VW]|[kMGT]B|px|degC)\b|%)")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -39,6 +40,11 @@ class SiteMap:
     n_shots: int
 
     @property
+    def mean(self) -> float:
+        """The share at all sites together; nan without trials."""
+        return float(self.n.sum() / n_trials) if (n_trials := self.n_trials.sum()) else math.nan
+
+    @property
     def values(self) -> Floats:
         """float64, the share at each site; nan where it is known from fewer than 5 trials."""
         return np.where(self.n_trials >= MIN_TRIALS, self.n / np.maximum(self.n_trials, 1), np.nan)
@@ -56,7 +62,7 @@ class SiteMap:
         n, n_trials = int(self.n.sum()), int(self.n_trials.sum())
         mean = (n + 0.5) / (n_trials + 1)
         errors = np.sqrt(mean * (1 - mean) / np.maximum(self.n_trials, 1))
-        return (self.values - n / max(n_trials, 1)) / errors
+        return (self.values - self.mean) / errors
 
 
 def site_map(run: Run, name: str, shots: Sequence[Shot] | None = None) -> SiteMap:

@@ -1,7 +1,6 @@
 """The commands of `labseq queue`; `labseq queue run` is in `labseq.cli.app`."""
 
-from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -37,15 +36,6 @@ Examples:
   labseq queue run
 """
 
-
-class IfFailsKind(StrEnum):
-    """What happens if the run of an entry fails."""
-
-    STOP = "stop"
-    SKIP = "skip"
-    RETRY = "retry"
-
-
 Id = Annotated[
     int,
     typer.Argument(
@@ -65,11 +55,11 @@ def add(
     output: Output = None,
     realtime: Realtime = False,
     if_fails: Annotated[
-        IfFailsKind,
+        Literal["stop", "skip", "retry"],
         typer.Option(
             "--if-fails", help="End the queue if this run fails, skip it, or resume it once and go on then."
         ),
-    ] = IfFailsKind.STOP,
+    ] = "stop",
     until: Annotated[
         str | None,
         typer.Option(
@@ -99,7 +89,7 @@ def add(
 
     changes, dry_run_kind, given_tags = tuple(overrides or ()), dry_run_mode(dry_run), tuple(tags or ())
     options = Options(profile, shots, seed, changes, output, dry_run_kind, realtime, note, given_tags)
-    add_entry(sequence, options, rules_from(if_fails.value, until, needs or ()))
+    add_entry(sequence, options, rules_from(if_fails, until, needs or ()))
 
 
 @queue.command(name="list", short_help="List the entries in order.")

@@ -15,6 +15,7 @@ from typing import Any, Final
 from labseq.assembly.assemble import assemble
 from labseq.assembly.calibrations import open_store
 from labseq.assembly.options import DryRun, Options
+from labseq.calibration_store import age_s
 from labseq.config.document import Document
 from labseq.config.find import find_profile
 from labseq.console.errors import exit_code_of, report, warning_lines
@@ -228,9 +229,8 @@ class QueueRun:
         profile = str(find_profile(str(named), entry.sequence.parent))
         for kind, max_age_s in entry.rules.needs.items():
             stored = open_store(profile, entry.options.dry_run)[0].entry_in_use(kind)
-            taken = None if stored is None else datetime.fromisoformat(stored.entry.taken_utc)
-            is_new = taken is not None and (now() - taken).total_seconds() <= max_age_s
-            if not is_new or kind in self.doubted:
+            # an age is unknown where this computer's clock is behind: nothing is newer than such an entry
+            if stored is None or (age_s(stored.entry) or 0.0) > max_age_s or kind in self.doubted:
                 self.calibrate(kind, profile, entry.options.dry_run)
                 self.doubted.discard(kind)
 

@@ -41,9 +41,8 @@ class SearchedPoints:
         self._sign = 1.0 if choice.minimise is None else -1.0
         self._current: tuple[int | None, Point | None] = -1, None
         self._visited: list[VisitedPoint] = []
-        self._has_warned = self._quantity.name.startswith(
-            RESULT_PREFIX
-        )  # the analyses warn of missing results
+        # the analyses warn of missing results
+        self._has_warned = self._quantity.name.startswith(RESULT_PREFIX)
 
     def next(self, history: History) -> Point | None:
         """The point of the next shot; the scanner is asked when all shots of the one before are there."""

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -46,6 +46,11 @@ class NoticeSettings(Settings):
         description="a run has failed, an alarm has begun, the disk is nearly full, the queue has ended",
     )
     free_gb: float = Field(default=5.0, gt=0, description="'disk': fewer GB than this are free")
+
+    def task(self, kind: str, run: str, text: str) -> dict[str, Any]:
+        """What :func:`labseq.session.send_notice.send` is to do."""
+        notice = {"kind": kind, "run": run, "text": f"labseq: {f'{run}: ' if run else ''}{text}"}
+        return {"command": self.command, "webhook": self.webhook, "notice": notice}
 
 
 class Notices:
@@ -106,14 +111,11 @@ class Notices:
         settings = self.settings
         if settings is None or kind not in settings.on:
             return
-        run = self._run_dir.name
-        notice = {"kind": kind, "run": run, "text": f"labseq: {f'{run}: ' if run else ''}{text}"}
-        deliver(self._root, settings.command, settings.webhook, notice)
+        deliver(self._root, settings.task(kind, self._run_dir.name, text))
 
 
-def deliver(root: Path, command: Sequence[str], webhook: str, notice: Mapping[str, str]) -> None:
+def deliver(root: Path, task: Mapping[str, Any]) -> None:
     """Start the process that sends a notice; it is not waited for."""
-    task = {"command": [*command], "webhook": webhook, "notice": notice, "log": str(root / NOTIFY_LOG)}
     process = subprocess.Popen(
         [sys.executable, "-m", "labseq.session.send_notice"],
         stdin=subprocess.PIPE,
@@ -123,5 +125,5 @@ def deliver(root: Path, command: Sequence[str], webhook: str, notice: Mapping[st
     )
     assert process.stdin is not None
     with process.stdin as pipe:
-        pipe.write(dumps(task).encode())
-    process.returncode = 0  # nobody waits for it, which Python would warn of
+        pipe.write(dumps({**task, "log": str(root / NOTIFY_LOG)}).encode())
+    process.returncode = 0  # Python would warn that it was not waited for

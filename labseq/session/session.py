@@ -31,6 +31,7 @@ from labseq.sequencer.lab import Lab, describe
 from labseq.sequencer.run import Sequencer, State
 from labseq.session.alarms import Alarms
 from labseq.session.check import check
+from labseq.session.checks import Checks
 from labseq.session.prepared import PreparedRun
 from labseq.session.provenance import code_of, copies, ending, notes_file, run_record
 from labseq.session.sources import RunCode
@@ -38,7 +39,6 @@ from labseq.session.stopping import check_stop_file
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
 if TYPE_CHECKING:
-    from labseq.session.checks import Checks
     from labseq.session.precision import Precision
     from labseq.session.resume import ResumableRun
 
@@ -105,11 +105,11 @@ class Shots:
         self._alarms.look(shot)
         return row
 
-    def take_all(self, checks: Checks | None, precision: Precision | None) -> None:
+    def take_all(self, checks: Checks, precision: Precision | None) -> None:
         """Take the shots until none is left, the points end, or the fits are precise enough.
 
         Args:
-            checks: Checks each shot; may end the run, or skip the rest of a point. None if there are none.
+            checks: Checks each shot; may end the run, or skip the rest of a point.
             precision: Judges the fits; None if the run takes all its shots.
 
         Raises:
@@ -119,7 +119,7 @@ class Shots:
             LabseqError: Another error that ended the run before its last shot.
         """
         points, history = self._run.points, self._run.history
-        last, why = (-1, "") if checks is None else checks.left_open
+        last, why = checks.left_open
         if why:  # an earlier process may have died before it could record what it skips
             self._skip(history.later_at_its_point(last), why)
         while (point := points.next(history)) is not None:
@@ -129,7 +129,7 @@ class Shots:
             failure = self.sequencer.take(shot)
             self._run.analyses.look()
             history.add(self._writer.run_dir, self._writer.last_row)
-            if why := failure or (checks.after(self._writer.last_row) if checks is not None else ""):
+            if why := failure or checks.after(self._writer.last_row):
                 self._skip([*([shot] if failure else []), *history.later_at_its_point(shot)], why)
             self._alarms.raise_if_lasting()
             if precision is not None and (why := precision.after(self._writer.last_row)):
@@ -374,6 +374,7 @@ class Session(PreparedRun):
         log, pulse = writer.run_dir / WATCHDOG_LOG, self.stop_flag.pulse
         watchdog = Watchdog(f"the run {writer.run_dir}", log, pulse, self._end_without_watchdog)
         shots = Shots(self, lab, first, writer, watchdog)
+        settings, target = self.assembly.sequence.policy.checks, self.assembly.target
         before = () if self.earlier is None else self.earlier.rows
         # in the reverse order of these lines: devices safe, results of analyses waited for, the mark removed
         with (
@@ -383,16 +384,8 @@ class Session(PreparedRun):
             self._analyses_finished(writer),
             self._devices(shots.sequencer, record, writer),
         ):
-            shots.take_all(self._checks(writer.run_dir, before), self._precision(writer.run_dir, before))
-
-    def _checks(self, run_dir: Path, before: Sequence[IndexRow]) -> Checks | None:
-        """The checks of the sequence; None if it has none."""
-        settings = self.assembly.sequence.policy.checks
-        if not settings:
-            return None
-        from labseq.session.checks import Checks  # loads what other runs do not need
-
-        return Checks(settings, run_dir, before, self.assembly.target, self.analyses, self.warn)
+            checks = Checks(settings, writer.run_dir, before, target, self.analyses, self.warn)
+            shots.take_all(checks, self._precision(writer.run_dir, before))
 
     def _precision(self, run_dir: Path, before: Sequence[IndexRow]) -> Precision | None:
         """What ends the run early; None if its sequence does not ask for it."""

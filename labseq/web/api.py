@@ -21,7 +21,6 @@ from labseq.console.events import scanned_names, scanned_values
 from labseq.data.site_maps import site_map
 from labseq.errors import RecordingError
 from labseq.files import read_file
-from labseq.model.estimate import Rate
 from labseq.plain import to_plain
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import read_state
@@ -185,13 +184,12 @@ class Api:
         counted = run.history.columns().counted.tolist()
         some = run.some(_evenly(counted, 500))
         found = site_map(some, name)
-        rate = Rate(int(found.n.sum()), int(found.n_trials.sum()))
         return {
             "quantity": text_of(name, 200),
             "choices": [text_of(choice, 200) for choice in choices],
             "values": [[finite(value) for value in row] for row in found.values.tolist()],
             "n_trials": found.n_trials.tolist(),
-            "mean": finite(rate.value),
+            "mean": finite(found.mean),
             "n_read": found.n_shots,
             "n_shots": len(counted),
         }

@@ -60,8 +60,8 @@ def test_every_way_is_tried_and_each_failure_is_named(
 
 
 class Sent(list[dict[str, str]]):
-    def __call__(self, root: Path, command: Any, webhook: str, notice: dict[str, str]) -> None:
-        self.append(notice)
+    def __call__(self, root: Path, task: dict[str, Any]) -> None:
+        self.append(task["notice"])
 
 
 def test_what_is_wanted_is_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,5 +102,6 @@ def test_the_file_is_checked_and_may_be_missing(tmp_path: Path, monkeypatch: pyt
 def test_a_program_that_hangs_is_not_waited_for(tmp_path: Path) -> None:
     notice = {"kind": "queue", "run": "", "text": "labseq: the end"}
     begun_s = time.monotonic()
-    notices.deliver(tmp_path, [sys.executable, "-c", "import time; time.sleep(3600)"], "", notice)
+    command = [sys.executable, "-c", "import time; time.sleep(3600)"]
+    notices.deliver(tmp_path, {"command": command, "webhook": "", "notice": notice})
     assert time.monotonic() - begun_s < MAX_S / 2
