@@ -31,7 +31,8 @@ from labseq_virtual.settings import SimulationSettings
 from numpy.typing import NDArray
 
 from labseq.plugin import AxisTones, MotionSpec, Plan, SiteGrid, ToneProgram, kernel
-from labseq.plugin.motion import FrequencyCourse, RfSpec, render, tone_program
+from labseq.plugin.motion import FrequencyCourse, RfSpec, tone_program
+from labseq.plugin.rendering import render
 from labseq.plugin.simulation import RfSamples
 
 Floats = NDArray[np.float64]

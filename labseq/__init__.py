@@ -50,10 +50,8 @@ _HOMES = {
         "VisitedPoint",
         "as_occupancy",
     ),
-    "labseq.motion": (
-        "check_plan",
-        "render",
-    ),
+    "labseq.motion": ("check_plan",),
+    "labseq.motion.rendering": ("render",),
     "labseq.data": (
         "Run",
         "open_run",

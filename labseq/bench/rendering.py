@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from labseq.assembly.planning import PlannedMoves, PlanRequest, plan_moves
 from labseq.console.report import Column, table
 from labseq.model import AxisTones, FrequencyCourse, SiteGrid, ToneProgram
-from labseq.motion import Renderer, comb_sample_rate, tone_program, warm_rendering
+from labseq.motion import tone_program
+from labseq.motion.rendering import Renderer, comb_sample_rate, warm_rendering
 from labseq.units import format_quantity
 
 N_CHANNELS: Final = 2

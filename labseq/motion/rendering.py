@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import weakref
 from collections import deque
@@ -176,6 +177,12 @@ MAX_SAMPLES: Final = 2**53
 
 MAX_WORKSPACES: Final = 8
 """Number of workspaces kept for rendering threads, 2 MB each."""
+
+
+def warm_rendering() -> None:
+    """Compile the kernels of rendering, or load them from the cache; for drivers that play samples."""
+    for kernels in ("render_direct_kernels", "render_comb_kernels"):
+        importlib.import_module(f"labseq.motion.{kernels}")
 
 
 class RenderPath(IntEnum):

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from labseq.model import AxisTones, MotionSpec, RfSpec, SegmentKind, SiteGrid, ToneProgram
 from labseq.model.motion import LOAD_OHM
-from labseq.motion import Renderer, RenderPath, drive
+from labseq.motion import drive
 from labseq.motion.axes import AXES, AxisIndex
-from labseq.motion.rendering import FULL_SCALE
+from labseq.motion.rendering import FULL_SCALE, Renderer, RenderPath
 
 CHUNK: Final = 1 << 18
 """Samples per chunk of the analysis: 2 MB in float64."""

@@ -27,8 +27,8 @@ from labseq.errors import ConfigError, LimitError, Problem
 from labseq.files import whole_file
 from labseq.messages import clean, visible
 from labseq.model import Plan, SegmentKind, ToneProgram
-from labseq.motion import Renderer, tone_program
-from labseq.motion.rendering import FULL_SCALE, N_CHANNELS
+from labseq.motion import tone_program
+from labseq.motion.rendering import FULL_SCALE, N_CHANNELS, Renderer
 from labseq.plans.axis_statistics import AxisStatistics, measure_axes
 from labseq.plans.plan_file import MAX_BYTES, read_plan
 from labseq.text_files import check_output, read_bytes

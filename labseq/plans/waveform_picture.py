@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.model import AxisTones, FrequencyCourse, RfSpec, SegmentKind, ToneProgram
-from labseq.motion import Renderer
-from labseq.motion.rendering import FULL_SCALE
+from labseq.motion.rendering import FULL_SCALE, Renderer
 from labseq.pictures.figures import make_figure, save_figure
 
 if TYPE_CHECKING:

@@ -29,7 +29,8 @@ from labseq.plugin import (
     format_quantity,
 )
 from labseq.plugin.lines import trigger_line
-from labseq.plugin.motion import check_tone_program, comb_sample_rate, warm_rendering
+from labseq.plugin.motion import check_tone_program
+from labseq.plugin.rendering import comb_sample_rate, warm_rendering
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard, Buffer
 from labseq_spcm.keep_warm import keep_warm_tones

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import DeviceError, DeviceTimeoutError, LimitError, ToneProgram, TransientError
-from labseq.plugin.motion import Renderer
+from labseq.plugin.rendering import Renderer
 from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard, Buffer
 from labseq_spcm.limits import FRAME_BYTES, SAMPLE_STEP
 from labseq_spcm.play_mode import PlayMode

@@ -21,8 +21,9 @@ from labseq.plugin import (
     TransientError,
     format_quantity,
 )
-from labseq.plugin.motion import Renderer, render_address, tone_program
+from labseq.plugin.motion import tone_program
 from labseq.plugin.native import WakeSignal, n_cores, new_timer, raise_priority, set_signal
+from labseq.plugin.rendering import Renderer, render_address
 from labseq_spcm import stream_kernels as k
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.keep_warm import KeepWarm, tone_samples

@@ -9,7 +9,7 @@ import pytest
 from labseq.bench.rendering import uniform_program
 from labseq.cli import main
 from labseq.model import SiteGrid
-from labseq.motion import Renderer, RenderPath
+from labseq.motion.rendering import Renderer, RenderPath
 
 GRID = SiteGrid()
 

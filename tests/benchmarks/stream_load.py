@@ -35,7 +35,8 @@ from labseq.bench.latency import draw_times
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.kernels.kernel import kernel, load_kernels
 from labseq.kernels.native import new_timer, now_ns, sleep_ns
-from labseq.motion import check_plan, tone_program, warm, warm_rendering
+from labseq.motion import check_plan, tone_program, warm
+from labseq.motion.rendering import warm_rendering
 from labseq.plugin import (
     Context,
     DepthRamp,

@@ -16,7 +16,8 @@ from labseq_virtual.simulation import VirtualSimulation
 
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import ToneProgram
-from labseq.motion import Renderer, check_plan, comb_sample_rate, tone_program
+from labseq.motion import check_plan, tone_program
+from labseq.motion.rendering import Renderer, comb_sample_rate
 from labseq.plugin import Context, DepthRamp, Frame, MotionSpec, RandomStream, SiteGrid, TargetPattern
 
 CHUNK = 1 << 15  # samples per channel that a stream needs first

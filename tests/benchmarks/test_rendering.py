@@ -19,8 +19,9 @@ import labseq
 from labseq.bench.rendering import Samples, in_two_threads, render_all, uniform_program
 from labseq.kernels.kernel import const, kernel
 from labseq.model import FrequencyCourse, MotionSpec, SiteGrid, TargetPattern, ToneProgram
-from labseq.motion import Renderer, comb_sample_rate, tone_program
+from labseq.motion import tone_program
 from labseq.motion.render_reference import render_reference
+from labseq.motion.rendering import Renderer, comb_sample_rate
 from labseq.roles import Context
 
 GRID = SiteGrid()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from labseq.errors import LimitError
 from labseq.model import FrequencyCourse, SiteGrid
-from labseq.motion import comb_sample_rate, render_comb_kernels, render_direct_kernels, render_kernels
+from labseq.motion import render_comb_kernels, render_direct_kernels, render_kernels
 from labseq.motion.render_kernels import (
     END,
     END_AMPLITUDE,
@@ -22,6 +22,7 @@ from labseq.motion.render_kernels import (
     SUM,
     take_tones,
 )
+from labseq.motion.rendering import comb_sample_rate
 
 
 @given(st.integers(-(2**31), 2**31 - 1))

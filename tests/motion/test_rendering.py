@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 import labseq
 from labseq.errors import LimitError
 from labseq.model import Batch, FrequencyCourse, MotionSpec, Plan, SiteGrid, ToneProgram
-from labseq.motion import Renderer, RenderPath, comb_sample_rate, render, tone_program
+from labseq.motion import tone_program
 from labseq.motion.render_reference import render_reference
-from labseq.motion.rendering import MAX_WORKSPACES
+from labseq.motion.rendering import MAX_WORKSPACES, Renderer, RenderPath, comb_sample_rate, render
 
 from .programs import STEP_HZ, Segment, program_of, site
 

@@ -10,8 +10,9 @@ import pytest
 
 from labseq.model import Batch, MotionSpec, Plan, RfSpec, SegmentKind, SiteGrid, TonePaths, ToneProgram
 from labseq.model.motion import SpeedProfile
-from labseq.motion import Renderer, RenderPath, tone_program
+from labseq.motion import tone_program
 from labseq.motion.render_reference import render_reference
+from labseq.motion.rendering import Renderer, RenderPath
 
 IDLE, PICK_UP, TRANSPORT, DROP_OFF = SegmentKind
 GRID = SiteGrid(6, 6)

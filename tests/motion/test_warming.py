@@ -8,20 +8,21 @@ import gc
 import sys
 import labseq.kernels.kernel as kernel
 import labseq.motion as motion
+import labseq.motion.rendering as rendering
 from labseq import Plan, SiteGrid, TargetPattern
 
 def loaded():
     return {one: {*one._dispatchers} for one in gc.get_objects() if isinstance(one, kernel._Kernel)}
 
 motion.warm()
-motion.warm_rendering()
+rendering.warm_rendering()
 kernel.load_kernels()
 warm, before = set(sys.modules), loaded()
 target = TargetPattern([[False, True]], [[True, False]])
 plan = Plan.from_batches([([(0, 0)], [(0, 1)])])
 motion.check_plan(plan, [[True, False]], target, 1)
 program = motion.tone_program(plan, SiteGrid(1, 2))
-motion.render(program)
+rendering.render(program)
 print(sorted(name for name in set(sys.modules) - warm if name.startswith("labseq")))
 print([one.__name__ for one, kinds in loaded().items() if kinds != before[one]])
 """

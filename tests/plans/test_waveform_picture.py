@@ -13,7 +13,8 @@ from PIL import Image
 
 from labseq.model import Batch, MotionSpec, Plan, SegmentKind
 from labseq.model.motion import SpeedProfile
-from labseq.motion import Renderer, render, tone_program
+from labseq.motion import tone_program
+from labseq.motion.rendering import Renderer, render
 from labseq.plans.waveform_picture import (
     DPI,
     INTENDED,

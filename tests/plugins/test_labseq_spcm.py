@@ -18,7 +18,8 @@ from labseq_spcm_sim import M4I6631, SimulatedCard, SimulatedLibrary, installed,
 from labseq_spcm_sim.library import CardOutputs
 from labseq_virtual.rf_analysis import active_spans, reach_hz
 
-from labseq.motion import render, tone_program
+from labseq.motion import tone_program
+from labseq.motion.rendering import render
 from labseq.plugin import (
     Context,
     DeviceError,

@@ -18,7 +18,8 @@ from labseq_spcm.settings import SpcmSettings
 from labseq_spcm.stream import Stream, check_rendering, stream_program
 from labseq_spcm_sim import M4I6631, SimulatedCard, installed, registers
 
-from labseq.motion import render, tone_program
+from labseq.motion import tone_program
+from labseq.motion.rendering import render
 from labseq.plugin import Context, DeviceError, MotionSpec, Plan, SiteGrid, ToneProgram, TransientError
 from labseq.plugin.motion import RfSpec
 
