@@ -189,12 +189,14 @@ class FitAt:
         written: The same in the units of the sequence.
         fit: The fit; None if it failed.
         problem: Why it failed, or "".
+        points: Indices of its points among those of the scan.
     """
 
     values: Mapping[str, Any]
     written: Mapping[str, str]
     fit: Fit | None
     problem: str
+    points: tuple[int, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """JSON-ready, SI."""
@@ -235,7 +237,8 @@ def fits_along(
             problem = "; ".join(problem.what for problem in error.problems)
         at = list(zip(others, place, strict=True))
         values = {axis.address: axis.value(i) for axis, i in at}
-        fits.append(FitAt(values, {axis.address: axis.labels[i] for axis, i in at}, fit, problem))
+        written = {axis.address: axis.labels[i] for axis, i in at}
+        fits.append(FitAt(values, written, fit, problem, tuple(members)))
     if errors and len(errors) == len(fits):
         raise errors[0]
     return fits

@@ -5,15 +5,15 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
 from labseq.data import Run
-from labseq.data.fits import Fit
+from labseq.data.fits import Parameter, readable
 from labseq.data.quantities import Quantity
-from labseq.data.scanned import fitter, request_of
+from labseq.data.scanned import FitAt, Scanned, fits_along, request_of
 from labseq.errors import ConfigError
 from labseq.messages import format_error
 from labseq.model.estimate import Estimated
@@ -25,21 +25,6 @@ _PERIOD_S: Final = 0.5
 """Minimum time between the starts of two fits of a quantity, in seconds."""
 _SLOW_S: Final = 20.0
 """Time after which the page says that a fit has not ended, in seconds."""
-
-
-@dataclass(frozen=True, slots=True)
-class Points:
-    """What is fitted.
-
-    Attributes:
-        x: The scanned values in the unit of the axis.
-        unit: That unit.
-        values: The mean at each.
-    """
-
-    x: tuple[float, ...]
-    unit: str
-    values: tuple[Estimated, ...]
 
 
 class LiveFit:
@@ -62,75 +47,98 @@ class LiveFit:
         self._started_s = 0.0
         self.is_ready = True
         self._thread: threading.Thread | None = None
-        self._result: dict[str, Any] = {"error": "the first fit is being computed"}
+        self._result = [_no_fit("the first fit is being computed")]
 
-    def result(self, points: Points | None) -> dict[str, Any]:
-        """The newest fit that is ready, for JSON; a fit of other points than before is begun.
+    def result(self, scan: Scanned, means: Sequence[Estimated]) -> list[dict[str, Any]]:
+        """The newest fits that are ready, for JSON; fits of other points than before are begun.
 
         Args:
-            points: The points so far; None if the scan is not one of a single number.
+            scan: The points so far.
+            means: The quantity at each.
+
+        Returns:
+            A fit along the first axis at each combination ``at`` of the values of the others; where there is
+            none, the reason.
         """
-        if points is None:
-            return {"error": "a fit needs a scan of one number"}
-        now_s, text = time.monotonic(), repr(points)
+        if scan.on_axis(0) is None:
+            return [_no_fit("a fit needs a scan of one number")]
+        now_s, text = time.monotonic(), repr([scan.axes, scan.places, means])
         is_busy = self._thread is not None and self._thread.is_alive()
         if text != self._points and not is_busy and now_s - self._started_s >= _PERIOD_S:
             self._points, self._started_s = text, now_s
             # not of a pool: the end of the server does not wait for a model that hangs
-            self._thread = threading.Thread(target=self._compute, args=(points, text), daemon=True)
+            self._thread = threading.Thread(target=self._compute, args=(scan, means, text), daemon=True)
             self._thread.start()
         self.is_ready = self._fitted_points == text
         if is_busy and now_s - self._started_s > _SLOW_S:
-            return {
-                "error": f"it has not ended after {_SLOW_S:.0f} s: fix a parameter, or choose another model"
-            }
+            what = f"it has not ended after {_SLOW_S:.0f} s: fix a parameter, or choose another model"
+            return [_no_fit(what)]
         return self._result
 
-    def _compute(self, points: Points, text: str) -> None:
+    def _compute(self, scan: Scanned, means: Sequence[Estimated], text: str) -> None:
         try:
-            self._result = self._fitted(points)
+            fits = fits_along(self._run, scan, self._quantity, means, request_of(self._measure))
+            self._result = self._described(fits, scan, means)
         except ConfigError as error:
-            problem = replace(error.problems[0], source="", line=0)
-            self._result = {"error": text_of(problem, 300)}
+            self._result = [_no_fit(replace(error.problems[0], source="", line=0))]
         except Exception as error:  # noqa: BLE001 - a model of a plugin
-            self._result = {"error": text_of(format_error(error), 300)}
+            self._result = [_no_fit(format_error(error))]
         self._fitted_points = text
 
-    def _fitted(self, points: Points) -> dict[str, Any]:
-        factor, request = factor_of(points.unit), request_of(self._measure)
-        fit = fitter(self._run, self._quantity, points.unit, request)(points.x, points.values)
-        curve = np.linspace(min(points.x), max(points.x), 201)
-        residuals = zip(points.x, points.values, fit.at(factor * np.array(points.x)).tolist(), strict=True)
-        return {
-            "error": "",
-            **_parameters(fit, self._measure.get("report")),
-            "curve": [curve.tolist(), [finite(y) for y in fit.at(factor * curve).tolist()]],
-            "residuals": [_residual(*one) for one in residuals],
-        }
+    def _described(
+        self, fits: Sequence[FitAt], scan: Scanned, means: Sequence[Estimated]
+    ) -> list[dict[str, Any]]:
+        report: str = self._measure.get("report") or ""
+        made = [at.fit for at in fits if at.fit is not None]
+        name = report if report in made[0].parameters else next(iter(made[0].parameters))
+        values = [fit.parameters[name] for fit in made]
+        shown = readable(max(abs(one.value) for one in values), values[0].text_unit)
+        return [_fit(at, scan, means, name, shown) for at in fits]
 
 
-def _parameters(fit: Fit, report: str | None) -> dict[str, Any]:
-    values = fit.as_json()
-    texts = {name: str(value) for name, value in fit.parameters.items()}
-    name = report if report in texts else next(iter(texts))
+def _no_fit(reason: object, at: Sequence[str] = ()) -> dict[str, Any]:
+    return {"at": [*at], "error": text_of(reason, 300)}
+
+
+def _fit(
+    at: FitAt, scan: Scanned, means: Sequence[Estimated], name: str, shown: tuple[str, float]
+) -> dict[str, Any]:
+    """A fit for JSON.
+
+    Args:
+        at: The fit.
+        scan: The points of the scan.
+        means: The quantity at each.
+        name: The parameter to report.
+        shown: The unit in which its values at all ``at`` are readable, and its factor to SI.
+    """
+    words = [text_of(word, 60) for word in at.written.values()]
+    numbers, unit = scan.on_axis(0) or ([], "")
+    if at.fit is None:
+        return _no_fit(at.problem, words)
+    factor, x = factor_of(unit), np.array([numbers[i] for i in at.points])
+    curve = np.linspace(x.min(), x.max(), 201)
+    fitted = at.fit.at(factor * x).tolist()
     return {
-        "model": text_of(fit.model, 60),
-        "report": {"name": name, "text": texts[name]},
-        "parameters": {
-            name: {key: finite(one) if isinstance(one, float) else one for key, one in about.items()}
-            | {"text": texts[name]}
-            for name, about in values["parameters"].items()
-        },
-        "reduced_chi_square": finite(values["reduced_chi_square"]),
-        "n_points": values["points"],
+        "at": words,
+        "error": "",
+        "model": text_of(at.fit.model, 60),
+        "report": {"name": name, "text": str(at.fit.parameters[name]), "unit": shown[0], "factor": shown[1]},
+        "parameters": {key: _parameter(one) for key, one in at.fit.parameters.items()},
+        "reduced_chi_square": finite(at.fit.reduced_chi_square),
+        "n_points": len(at.fit.x),
+        "curve": [curve.tolist(), [finite(y) for y in at.fit.at(factor * curve).tolist()]],
+        "residuals": [
+            _residual(*one) for one in zip(x.tolist(), [means[i] for i in at.points], fitted, strict=True)
+        ],
     }
+
+
+def _parameter(parameter: Parameter) -> dict[str, Any]:
+    value, error = finite(parameter.value), finite(parameter.error)
+    return {"value": value, "error": error, "unit": parameter.unit, "text": str(parameter)}
 
 
 def _residual(x: float, value: Estimated, fitted: float) -> dict[str, Any]:
     interval = [None if end is None else end - fitted for end in interval_of(value)]
     return {"x": x, "value": finite(value.value - fitted), "interval": interval}
-
-
-def points_to_fit(on_axis: tuple[list[float], str] | None, means: Sequence[Estimated]) -> Points | None:
-    """The points of a scan along one axis; None if its values are not numbers."""
-    return None if on_axis is None else Points(tuple(on_axis[0]), on_axis[1], tuple(means))

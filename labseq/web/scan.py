@@ -16,7 +16,7 @@ from labseq.errors import LabseqError
 from labseq.model.estimate import Estimated
 from labseq.model.image_quantities import OF_IMAGES, parse_name
 from labseq.recording.run_file import SCANNER
-from labseq.web.fitting import LiveFit, points_to_fit
+from labseq.web.fitting import LiveFit
 from labseq.web.runs import OpenRun, text_of
 from labseq.web.series import about_quantity, finite, mean_values
 
@@ -128,9 +128,8 @@ class ScanView:
         about = about_quantity(series.quantity, [mean.value for mean in means])
         fit = self._fits.get(series.quantity.name)
         if fit is None:
-            return {**about, "fit": None}
-        points = points_to_fit(shown.on_axis(0) if len(shown.axes) == 1 else None, means)
-        return {**about, "fit": fit.result(points)}
+            return {**about, "fits": []}
+        return {**about, "fits": fit.result(shown, means)}
 
 
 def _first_shots(run: OpenRun) -> Any:

@@ -31,6 +31,7 @@ from tests.recording.records import make_shot
 
 from .clients import TOKEN, path_of, shot_of_frames, write_run
 from .test_actions import entry
+from .test_measured import held_at, scan_of_two
 
 ROOT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -166,6 +167,21 @@ def test_a_run_is_watched_from_its_first_shot_to_its_last(server: Server, watche
         assert canvas.evaluate(
             "c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some(v => v)"
         )
+    assert watched.faults == []
+
+
+def test_each_fit_of_a_scan_of_two_values_can_be_looked_at(server: Server, watched: Watched) -> None:
+    writer, page = scan_of_two(server.data), watched.page
+    for index in range(10):
+        writer.write_shot(held_at(index))
+    page.goto(f"{server.address.rstrip('/')}/scan")
+    rows = page.locator("section[aria-label^='Fits of survival'] tbody tr")
+    expect(rows).to_have_count(2)
+    shown = page.locator("section[aria-label='survival:image_0,image_1'] .chart").first
+    before = shown.get_attribute("aria-label")
+    page.get_by_label("Fit to show").select_option("1")
+    expect(shown).not_to_have_attribute("aria-label", before)
+    expect(shown).to_have_attribute("aria-label", re.compile("5 points, the last 10 % at duration in s 20"))
     assert watched.faults == []
 
 

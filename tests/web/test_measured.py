@@ -31,10 +31,10 @@ HELD_S = (1.0, 2.0, 5.0, 10.0, 20.0)
 NO_TARGET = TargetPattern(np.zeros(SHAPE, np.bool_), np.zeros(SHAPE, np.bool_), "none")
 
 
-def held(index: int, point: int) -> ShotRecord:
+def held(index: int, point: int, life_s: float = 8.0) -> ShotRecord:
     """A shot without a target: 20 atoms, of which some are left at the end."""
     shot = make_shot(index, n_images=2, batches=(), success=None, filling_fraction=np.nan)
-    n_left = round(20 * np.exp(-HELD_S[point] / 8))
+    n_left = round(20 * np.exp(-HELD_S[point] / life_s))
     left = np.arange(20).reshape(SHAPE) < n_left
     first, last = shot.images
     images = [replace(first, occupancy=np.ones(SHAPE, np.bool_)), replace(last, occupancy=left)]
@@ -59,6 +59,26 @@ def scan_of_holds(root: Path, n_points: int = len(HELD_S), *, measured: str = SU
     return writer
 
 
+def scan_of_two(root: Path) -> RunWriter:
+    """A run of ten shots, none of which is taken yet: how long atoms are held, at two pressures."""
+    points = [[held_s, pressure] for held_s in HELD_S for pressure in (2.0, 1.0)]
+    scan = {
+        "addresses": ["shot.hold.duration", "variables.pressure"],
+        "points": points,
+        "written": [[f"{held_s:g} s", f"{pressure:g}"] for held_s, pressure in points],
+        "repeats": 1,
+        "order": "sequential",
+        "point_of_shot": [*range(10)],
+    }
+    resolved = {"measure": [{"value": SURVIVAL, "fit": "exponential", "report": "decay"}]}
+    return write_run(root, 0, n_shots=10, target=NO_TARGET, scan=scan, resolved=resolved)
+
+
+def held_at(index: int) -> ShotRecord:
+    shot, pressure = held(index, index // 2, 8.0 / (2, 1)[index % 2]), (2.0, 1.0)[index % 2]
+    return replace(shot, parameters={**shot.parameters, "variables.pressure": pressure})
+
+
 def scan_at(client: Client, writer: RunWriter, quantity: str = "") -> Any:
     answer = client.get(f"{path_of(writer.run_dir)}/scan?quantity={quote(quantity)}")
     assert answer.status_code == 200, answer.text
@@ -75,7 +95,7 @@ def test_points_and_fit_of_a_scan_without_a_target(tmp_path: Path) -> None:
     assert [point["values"][0]["interval"] for point in scan["points"]] == [[*m.interval] for m in means]
     ((fitted_at,),) = report.fits
     assert fitted_at.fit is not None
-    expected, fit = to_plain(fitted_at.fit), shown["fit"]
+    expected, fit = to_plain(fitted_at.fit), shown["fits"][0]
     assert fit["error"] == ""
     for name, about in expected["parameters"].items():
         assert fit["parameters"][name]["value"] == pytest.approx(about["value"])
@@ -137,12 +157,32 @@ def test_a_quantity_that_no_shot_has_is_answered_with_those_that_there_are(tmp_p
 def test_a_fit_with_too_few_points_says_so_and_is_made_when_there_are_enough(tmp_path: Path) -> None:
     writer = scan_of_holds(tmp_path, 2)
     client = client_of(tmp_path)
-    fit = scan_at(client, writer)["quantities"][0]["fit"]
+    fit = scan_at(client, writer)["quantities"][0]["fits"][0]
     assert "2 points are too few" in fit["error"]
     assert "\n" not in fit["error"]
     for index in range(2, 5):
         writer.write_shot(held(index, index))
-    assert scan_at(client, writer)["quantities"][0]["fit"]["n_points"] == 5
+    assert scan_at(client, writer)["quantities"][0]["fits"][0]["n_points"] == 5
+
+
+def test_a_scan_of_two_values_is_fitted_at_each_of_the_second(tmp_path: Path) -> None:
+    """And where the points of one are too few, its row says so beside the fit of the other."""
+    writer, client = scan_of_two(tmp_path), client_of(tmp_path)
+    for index in (0, 1, 2, 3, 4, 6, 8):
+        writer.write_shot(held_at(index))
+    first, second = scan_at(client, writer)["quantities"][0]["fits"]
+    assert (first["at"], first["n_points"], second["at"]) == (["2"], 5, ["1"])
+    assert "2 points are too few" in second["error"]
+    for index in (5, 7, 9):
+        writer.write_shot(held_at(index))
+    fits = scan_at(client, writer)["quantities"][0]["fits"]
+    (expected,) = scan_report(open_run(writer.run_dir), ScanRequest()).fits
+    assert [fit["at"] for fit in fits] == [[*at.written.values()] for at in expected]
+    for fit, at in zip(fits, expected, strict=True):
+        assert at.fit is not None
+        assert fit["report"]["text"] == str(at.fit.parameters["decay"])
+        assert [one["value"] for one in fit["residuals"]] == pytest.approx(at.fit.residuals.tolist())
+        assert fit["residuals"][0]["interval"][0] < fit["residuals"][0]["value"]
 
 
 def test_the_page_goes_on_while_a_model_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,9 +200,9 @@ def test_the_page_goes_on_while_a_model_hangs(tmp_path: Path, monkeypatch: pytes
     writer.write_shot(held(4, 4))
     state = client.get(path).json()
     assert state["run"]["n_done"] == 5
-    assert "computed" in state["scan"]["quantities"][0]["fit"]["error"]
+    assert "computed" in state["scan"]["quantities"][0]["fits"][0]["error"]
     release.set()
-    assert "ZeroDivisionError" in scan_at(client, writer)["quantities"][0]["fit"]["error"]
+    assert "ZeroDivisionError" in scan_at(client, writer)["quantities"][0]["fits"][0]["error"]
 
 
 def test_the_last_good_shot_is_shown_after_attempts_that_failed(tmp_path: Path) -> None:
@@ -188,7 +228,7 @@ def test_a_run_of_the_shipped_lifetime_sequence_has_its_decay(tmp_path: Path) ->
     report = scan_report(run, ScanRequest(fit=FitRequest("exponential", {})))
     ((fitted_at,),) = report.fits
     assert fitted_at.fit is not None
-    decay = answer["quantities"][0]["fit"]["parameters"]["decay"]
+    decay = answer["quantities"][0]["fits"][0]["parameters"]["decay"]
     assert decay["value"] == pytest.approx(fitted_at.fit.parameters["decay"].value)
 
 

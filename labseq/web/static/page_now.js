@@ -4,7 +4,7 @@ import { drawArray, drawFrame } from "./array.js";
 import { bars, closeCharts, progressBar, stageBar } from "./charts.js";
 import { clock, count, el, facts, localTime, panel, patch, percent, percentWithError, post, replace, runLink, runPath, statusPill, table, time, withError } from "./dom.js";
 import { follow, oneSlot } from "./live.js";
-import { axisName, drawTrend, measuredTiles, scanCurve, tile, titleOf } from "./measured.js";
+import { axisName, drawTrend, measuredTiles, parameterCurve, scanCurve, tile, titleOf } from "./measured.js";
 
 export async function showNow(main, _, asked) {
   const id = asked.get("run");
@@ -68,15 +68,15 @@ function makeView(main) {
 
   // What is measured against the scanned value first, then by shot.
   function trendsOf({ run, measured, scan }) {
-    const hasCurve = Boolean(scan?.points?.length && !scan.is_map && scan.quantities.length);
+    const hasCurve = Boolean(scan?.points?.length && scan.quantities.length && (!scan.is_map || scan.quantities[0].fits.length));
     const names = [...(hasCurve ? [""] : []), ...measured.filter((one) => one.trend.length).map((one) => one.name)];
     if (String([run.id, ...names]) !== trends.names) {
       trends.names = String([run.id, ...names]);
       closeCharts();
-      charts = new Map(names.map((name) => [name, name === "" ? scanCurve() : { node: el("div.chart") }]));
-      replace(trends, [...charts].map(([name, chart]) => panel(name === "" ? `${titleOf(scan.quantities[0])} by ${axisName(scan.axes[0])}` : titleOf(measured.find((one) => one.name === name)), { class: "trend" }, chart.node)));
+      charts = new Map(names.map((name) => [name, name === "" ? (scan.is_map ? parameterCurve() : scanCurve()) : { node: el("div.chart") }]));
+      replace(trends, [...charts].map(([name, chart]) => panel(name === "" ? `${scan.is_map ? "Fits of " : ""}${titleOf(scan.quantities[0])} by ${axisName(scan.axes[0])}` : titleOf(measured.find((one) => one.name === name)), { class: "trend" }, chart.node)));
     }
-    if (hasCurve) charts.get("").draw(scan, 0, 0, chartHeight);
+    if (hasCurve) charts.get("").draw(scan, 0, chartHeight);
     for (const one of measured) if (charts.has(one.name)) drawTrend(charts.get(one.name).node, one, { height: chartHeight });
   }
 

@@ -3,7 +3,7 @@ import { go, server } from "./app.js";
 import { positions } from "./array.js";
 import { bars, siteMap } from "./charts.js";
 import { count, el, facts, failure, getJson, localTime, panel, patch, percent, percentWithError, post, replace, runLink, runPath, statusPill, table, time, withError } from "./dom.js";
-import { drawTrend, isOfTarget, meanText, titleOf, valueText } from "./measured.js";
+import { axisName, drawTrend, isOfTarget, meanText, parameterCurve, scanCurve, titleOf, valueText } from "./measured.js";
 import { headOf, stageTable, tilesOf } from "./page_now.js";
 import { scanOfRun } from "./page_scan.js";
 
@@ -138,24 +138,36 @@ export async function showCompare(main, _, asked) {
   const names = [...new Set(runs.flatMap((r) => r.measured.map((one) => one.name)))];
   const ofRun = (r, name) => r.measured.find((one) => one.name === name);
   const rows = [["profile", (r) => r.run.profile], ["status", (r) => r.run.status], ["shots", (r) => `${r.run.n_done} of ${r.run.n_shots}`],
-    ...names.map((name) => [name, (r) => (ofRun(r, name) ? meanText(ofRun(r, name), ofRun(r, name)) : "–")]), ["fit", (_, i) => fitsOf(scans[i])],
+    ...names.map((name) => [name, (r) => (ofRun(r, name) ? meanText(ofRun(r, name), ofRun(r, name)) : "–")]), ...parametersOf(scans),
     ["cycles", (r) => r.figures.cycles?.toFixed(2) ?? "–"], ["time of a shot", (r) => time(r.figures.shot_s)], ["seed", (r) => r.run.seed],
     ["changed", (r) => Object.entries(r.changes).map(([k, v]) => `${k} = ${v}`).join(", ") || "nothing"], ["calibrations", (r) => Object.entries(r.calibrations).map(([k, v]) => `${k} ${v}`).join(", ") || "none"], ["comment", (r) => r.run.comment || "–"]];
-  const charts = names.flatMap((name) => runs.filter((r) => ofRun(r, name)?.trend.length).map((r) => [ofRun(r, name), r, el("div.chart")]));
+  const charts = names.flatMap((name) => runs.map((r, i) => ({ name, r, scan: scanWith(scans[i], name), trend: ofRun(r, name), box: el("div.chart") }))).filter((one) => one.scan || one.trend?.trend.length);
+  for (const one of charts) if (one.scan) one.curve = one.scan.is_map ? parameterCurve() : scanCurve();
   replace(main, el("h1", {}, "Two runs"), table(["", ...runs.map((r) => r.run.id)], rows.map(([name, of]) => ({ mark: of(runs[0], 0) === of(runs[1], 1) ? "" : "is-other", cells: [name, of(runs[0], 0), of(runs[1], 1)] })), { label: "Figures of both runs" }),
     el("div.sub-line", {}, runs.map((r) => runLink(r.run.id))),
-    el("div.grid", {}, charts.map(([one, r, box]) => panel(`${titleOf(one)}: ${r.run.id}`, { class: "half" }, box)),
+    el("div.grid", {}, charts.map((one) => panel(`${titleOf(one.trend ?? { name: one.name, title: one.name })}${one.scan ? ` by ${axisName(one.scan.axes[0])}` : ""}: ${one.r.run.id}`, { class: "half" }, one.curve?.node ?? one.box)),
       panel("Lines of the sequences that differ", { class: "wide" }, differences(texts))));
-  for (const [one, , box] of charts) drawTrend(box, one, { fixed: rangeOf(runs.map((r) => ofRun(r, one.name)).filter(Boolean)) });
+  for (const { name, scan, trend, box, curve } of charts) {
+    if (curve) curve.draw(scan, placeIn(scan, name), () => 200, { more: { fixed: rangeOf(charts.filter((one) => one.name === name && one.scan).flatMap((one) => one.scan.points.map((point) => point.values[placeIn(one.scan, name)]))) } });
+    else drawTrend(box, trend, { fixed: rangeOf(runs.flatMap((r) => ofRun(r, name)?.trend ?? [])) });
+  }
 }
 
-function fitsOf(scan) {
-  return (scan?.quantities ?? []).filter((one) => one.fit?.report).map((one) => `${one.fit.report.name} ${one.fit.report.text}`).join(", ") || "–";
+const placeIn = (scan, name) => scan.quantities.findIndex((one) => one.name === name);
+// The scan if it has points with this quantity that a chart can show
+const scanWith = (scan, name) => (scan?.points?.length && placeIn(scan, name) >= 0 && (!scan.is_map || scan.quantities[placeIn(scan, name)].fits.length) ? scan : null);
+
+// A row for each parameter of the fits of either run
+function parametersOf(scans) {
+  const fits = scans.map((scan) => (scan?.quantities ?? []).flatMap((one) => one.fits).filter((fit) => !fit.error));
+  const names = [...new Set(fits.flat().flatMap((fit) => Object.entries(fit.parameters).filter(([, one]) => one.error).map(([name]) => name)))];
+  const text = (fit, name) => (fit.at.length ? `${fit.parameters[name].text} at ${fit.at.join(", ")}` : fit.parameters[name].text);
+  return names.map((name) => [name, (_, i) => fits[i].filter((fit) => fit.parameters[name]).map((fit) => text(fit, name)).join("; ") || "–"]);
 }
 
 // The same range for both runs
-function rangeOf(quantities) {
-  const ends = quantities.flatMap((one) => one.trend.flatMap((bin) => [bin.value, ...bin.interval])).filter((value) => value !== null);
+function rangeOf(means) {
+  const ends = means.flatMap((mean) => [mean.value, ...mean.interval]).filter((value) => value !== null);
   if (!ends.length) return [0, 1];
   const low = Math.min(...ends), high = Math.max(...ends), pad = 0.05 * (high - low || Math.abs(high) || 1);
   return [low - pad, high + pad];

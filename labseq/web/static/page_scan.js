@@ -3,7 +3,7 @@ import { go, setLink } from "./app.js";
 import { closeCharts, curve, heatMap } from "./charts.js";
 import { el, getJson, panel, patch, replace, runPath, table } from "./dom.js";
 import { follow } from "./live.js";
-import { axisName, fitLine, fullText, scanCurve, shortName, titleOf, valueText } from "./measured.js";
+import { axisName, fullText, parameterCurve, scanCurve, shortName, titleOf, valueText } from "./measured.js";
 import { alarmList, headOf } from "./page_now.js";
 
 export async function showScan(main, _, asked) {
@@ -46,16 +46,24 @@ function drawScan(body, scan) {
   const parts = body.parts ??= makeParts(body, scan);
   if (scan.visits) drawVisits(parts, scan);
   if (scan.is_map) drawMaps(parts, scan);
-  else for (const { chart, q, a } of parts.curves) chart.draw(scan, q, a, () => 240);
+  else for (const { chart, q, a } of parts.curves) chart.draw(scan, q, () => 240, { a });
+  for (const fits of parts.fits) drawFits(fits, scan);
   patch(parts.table, pointTable(scan));
 }
 
 function makeParts(body, scan) {
-  const parts = { visits: el("div.chart"), best: el("div"), table: el("div"), maps: el("div.maps"), curves: [] };
+  const parts = { visits: el("div.chart"), best: el("div"), table: el("div"), maps: el("div.maps"), curves: [], fits: [] };
   const panels = [];
   if (scan.visits) panels.push(panel(`${scan.figure}: points in the order they were tried`, { class: "half" }, parts.visits), panel("Best so far", { class: "half" }, parts.best));
-  if (scan.is_map) panels.push(panel("Map", { class: "wide" }, parts.maps));
-  else {
+  if (scan.is_map) {
+    panels.push(panel("Map", { class: "wide" }, parts.maps));
+    parts.fits = scan.quantities.map((quantity, q) => ({ quantity, q })).filter(({ quantity }) => quantity.fits.length)
+      .map(({ q }) => ({ q, at: null, values: parameterCurve(), slice: scanCurve(), choice: el("div.choice") }));
+    for (const { q, values, slice, choice } of parts.fits) {
+      const title = titleOf(scan.quantities[q]);
+      panels.push(panel(`Fits of ${title} along ${axisName(scan.axes[0])}`, { class: "half" }, values.node), panel(title, { class: "half", aside: choice }, slice.node));
+    }
+  } else {
     const kind = scan.axes.length * scan.quantities.length === 1 ? "wide" : "half";
     scan.axes.forEach((axis, a) => scan.quantities.forEach((quantity, q) => {
       const chart = scanCurve();
@@ -69,8 +77,20 @@ function makeParts(body, scan) {
 }
 
 function drawMaps(parts, scan) {
-  patch(parts.maps, scan.quantities.map((quantity, q) => el("div", {}, el("h3", {}, titleOf(quantity)), fitLine(quantity.fit),
+  patch(parts.maps, scan.quantities.map((quantity, q) => el("div", {}, el("h3", {}, titleOf(quantity)),
     heatMap(scan.axes, scan.points.map((p) => ({ i: p.place[0], j: p.place[1], value: p.values[q].value, text: `${p.written.join(", ")}: ${fullText(quantity, p.values[q])}` })), titleOf(quantity), (value) => valueText(quantity, value)))));
+}
+
+// Of a map with fits: the reported parameter against the second axis, and one of the fits with its points.
+function drawFits(fits, scan) {
+  fits.values.draw(scan, fits.q, () => 200);
+  const others = scan.axes.slice(1), words = (point) => others.map((axis, i) => axis.words[point.place[i + 1]]);
+  const places = [...new Map(scan.points.map((point) => [String(words(point)), words(point)])).entries()];
+  const [, at] = places.find(([key]) => key === fits.at) ?? places[0];
+  const onchange = (event) => { fits.at = event.target.value; drawFits(fits, scan); };
+  patch(fits.choice, el("label", {}, `at ${others.map((axis) => shortName(axis.address)).join(", ")} `, el("select", { "aria-label": "Fit to show", onchange },
+    places.map(([key, one]) => el("option", { value: key, selected: key === String(at) }, one.join(", "))))));
+  fits.slice.draw(scan, fits.q, () => 200, { at });
 }
 
 function drawVisits(parts, scan) {
