@@ -11,7 +11,10 @@ from labseq.console.output import compiling_text, say
 from labseq.console.text import percent, plural
 from labseq.messages import clean
 from labseq.model import RunRecord
+from labseq.model.image_quantities import measured_in
+from labseq.recording.folders import RESULT_PREFIX
 from labseq.recording.index import IndexRow
+from labseq.recording.results import Results, results_file
 from labseq.units import format_quantity, written
 
 LASTING: Final = frozenset(
@@ -42,20 +45,63 @@ class LogLines:
         self._stream = stream
         self._events = events or LASTING | {"shot_finished", "scan_point", "scan_ended"}
         self._run: RunRecord | None = None
+        self._results: list[MeasuredResults] = []
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Print the line of an event, if it has one."""
+        """Print the line of an event, if it has one, and results that have come since the last."""
         if name == "run_starting":
             self._run = values["record"]
+            names = measured_in(values["record"].resolved) if "shot_finished" in self._events else ()
+            of_analyses = (one for one in names if one.startswith(RESULT_PREFIX))
+            self._results = [MeasuredResults(Path(values["run_dir"]), one) for one in of_analyses]
         text = event_text(name, values, self._run) if name in self._events else ""
         if text:
             say(text, stream=self._stream)
+        if name in ("shot_finished", "run_finished"):
+            for results in self._results:
+                say(*results.new(values.get("row")), stream=self._stream)
 
     def refresh(self) -> None:
         """Do nothing: every line was printed at once."""
 
     def close(self) -> None:
         """Do nothing: the terminal was not changed."""
+
+
+class MeasuredResults:
+    """A result of an analysis that a run measures: it comes later than its shot, and has a line of its own.
+
+    Args:
+        run_dir: The run's folder.
+        name: "analysis.NAME.KEY".
+    """
+
+    def __init__(self, run_dir: Path, name: str) -> None:
+        analysis, _, self._key = name.removeprefix(RESULT_PREFIX).partition(".")
+        self._name = clean(name)
+        self._results = Results(results_file(run_dir, analysis))
+        self._awaited: set[int] = set()
+
+    def new(self, row: IndexRow | None = None) -> list[str]:
+        """The lines of shots whose results have come.
+
+        Args:
+            row: A shot that is over, whose result is awaited from now on.
+
+        Raises:
+            RecordingError: The results cannot be read.
+        """
+        if row is not None and row.counts:
+            self._awaited.add(row.shot)
+        self._results.read()
+        come = sorted(self._awaited & self._results.rows.keys())
+        self._awaited.difference_update(come)
+        values = ((shot, self._results.rows[shot].get(self._key)) for shot in come)
+        return [
+            f"shot {shot}  {self._name} {value:.6g}"
+            for shot, value in values
+            if isinstance(value, bool | int | float)
+        ]
 
 
 def event_text(  # noqa: C901 - a case for each event

@@ -3,11 +3,13 @@ from __future__ import annotations
 import io
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from labseq.console.events import LogLines, event_text
+from labseq.recording.results import ResultsLog, results_file
 
 
 def lines_of(events: Any) -> list[str]:
@@ -47,6 +49,26 @@ def test_what_goes_wrong_is_reported(fake: Any) -> None:
         "warning: camera could not be brought to its safe state: camera: mute",
         "warning: shutter could not be closed: shutter: jammed",
     ]
+
+
+def test_a_measured_result_has_a_line_when_it_comes(tmp_path: Path, fake: Any) -> None:
+    """After its shot, whatever comes meanwhile; those of other shots and what failed have none."""
+    resolved = {"measure": [{"value": "analysis.heat.n"}, {"value": "loading"}]}
+    stream = io.StringIO()
+    log = LogLines(stream)
+    log.event("run_starting", {"record": replace(fake.run(), resolved=resolved), "run_dir": str(tmp_path)})
+    log.event("shot_finished", {"row": fake.row(0)})
+    results = ResultsLog(results_file(tmp_path, "heat"), {"analysis": "heat"})
+    for shot, n in ((0, 3.25), (1, 4.0), (2, "none")):
+        results.write(shot, {"n": n})
+    log.event("shot_finished", {"row": fake.row(2)})
+    log.event("shot_finished", {"row": fake.row(3, status="failed")})
+    results.write(3, {"n": 5.0})
+    log.event("shot_finished", {"row": fake.row(4)})
+    results.write(4, {"n": 6})
+    log.event("run_finished", {"status": "complete"})
+    lines = [line for line in stream.getvalue().splitlines() if "heat" in line]
+    assert lines == ["shot 0  analysis.heat.n 3.25", "shot 4  analysis.heat.n 6"]
 
 
 @pytest.mark.parametrize(
