@@ -56,10 +56,8 @@ _HOMES = {
         "Run",
         "open_run",
     ),
-    "labseq.data.catalogue": (
-        "RunEntry",
-        "runs",
-    ),
+    "labseq.data.catalogue": ("runs",),
+    "labseq.data.entry": ("RunEntry",),
     "labseq.session.session": ("Session",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

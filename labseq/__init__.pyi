@@ -10,10 +10,8 @@ from labseq.data import (
     Run as Run,
     open_run as open_run,
 )
-from labseq.data.catalogue import (
-    RunEntry as RunEntry,
-    runs as runs,
-)
+from labseq.data.catalogue import runs as runs
+from labseq.data.entry import RunEntry as RunEntry
 from labseq.errors import (
     ConfigError as ConfigError,
     DeviceError as DeviceError,

@@ -176,6 +176,35 @@ def written(value: float, unit: str) -> str:
     return f"{value / factor_of(unit):.12g} {unit}"
 
 
+def with_error(value: float, error: float) -> str:
+    """A value with the error of its last digit in brackets; "-" for nan.
+
+    Args:
+        value: In any unit.
+        error: Its standard error in the same unit; nan if unknown.
+
+    Example:
+        >>> with_error(29.6142, 0.031), with_error(5988.0, 12.0), with_error(1.0, 0.0)
+        ('29.61(3)', '5990(10)', '1')
+        >>> with_error(0.4, 0.096), with_error(7.123456, math.nan)
+        ('0.4(1)', '7.123')
+        >>> with_error(99.555555555555543, 8e-15)  # rounding is not an error
+        '99.56'
+    """
+    if math.isnan(value):
+        return "-"
+    # A relative scatter below 1e-12 is only rounding.
+    if not math.isfinite(error) or error <= 1e-12 * abs(value):
+        return f"{value:.4g}"
+    digit = math.floor(math.log10(error))
+    if round(error / 10.0**digit) == 10:
+        digit += 1
+    rounded = round(error / 10.0**digit)
+    if digit >= 0:
+        return f"{round(value, -digit):.0f}({rounded * 10**digit})"
+    return f"{value:.{-digit}f}({rounded})"
+
+
 def scaled(number: float, factor: float) -> float:
     """Multiply without rounding errors for powers of ten: 4.49 um is 4.49e-06, not 4.4899...e-06.
 

@@ -38,8 +38,9 @@ from labseq.analysis.statistics import Statistics, Survival, SurvivalCounts, sta
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration_store import read_entry
 from labseq.data import Run, Shot
-from labseq.data.fits import Fit, readable
+from labseq.data.fits import Fit
 from labseq.data.images import loading_map
+from labseq.data.numbers import readable
 from labseq.data.quantities import WITH_TARGET, Quantity, measured_by, quantity_of, steps_that_load
 from labseq.data.results import own_fits
 from labseq.data.scanned import FitAt, Scanned, is_geometric, scanned

@@ -15,7 +15,8 @@ from labseq.console.output import say
 from labseq.console.report import Column, aligned, print_report, table
 from labseq.console.runs import folder_of_run
 from labseq.console.text import plural
-from labseq.data.catalogue import RunEntry, runs
+from labseq.data.catalogue import runs
+from labseq.data.entry import RunEntry
 from labseq.errors import ConfigError, Problem, one_of
 from labseq.messages import clean, visible
 from labseq.recording import data_root

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from labseq.data import Run, open_run
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import visible
 from labseq.recording import data_root
 from labseq.recording.folders import find_run
 from labseq.recording.listing import newest_run
+
+if TYPE_CHECKING:
+    from labseq.data import Run
 
 
 def chosen_run(path: Path | None, where: Sequence[str] | None = None) -> Run:
@@ -24,6 +27,8 @@ def chosen_run(path: Path | None, where: Sequence[str] | None = None) -> Run:
         ConfigError: There is no such run, or no such shot.
         RecordingError: It is damaged.
     """
+    from labseq.data import open_run  # with numpy, which commands that only name a run do not need
+
     return open_run(folder_of_run(path)).select(*where or ())
 
 

@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike
 
 from labseq.data.fit_models import MODELS, FitModel, Points, Solution
 from labseq.data.least_squares import Floats
+from labseq.data.numbers import Parameter
 from labseq.errors import ConfigError, Problem, one_of
 from labseq.messages import clean, did_you_mean
 from labseq.model.estimate import Estimate, Estimated
-from labseq.units import UNITS, dimension_of, parse_any, readable_unit
+from labseq.units import parse_any
 
 if TYPE_CHECKING:
     from labseq.data.lab_models import LabModel  # with the plugins, it takes a while to import
@@ -26,64 +27,6 @@ ROUNDING: Final = 1e-9
 """Relative error below which a value counts as without error."""
 MAX_ERROR: Final = 10.0
 """Largest error of a parameter, relative to its value or to the range of the points."""
-
-
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """A fitted parameter.
-
-    Attributes:
-        value: Its value, SI; a fraction, where the text has per cent.
-        error: Its standard error; 0 if it was fixed.
-        text_unit: SI unit, in which "%" stands for a fraction: "%/s".
-    """
-
-    value: float
-    error: float
-    text_unit: str
-
-    @property
-    def unit(self) -> str:
-        """Its SI unit; "" for none."""
-        return self.text_unit.replace("%/", "1/").replace("%", "")
-
-    def __str__(self) -> str:
-        """The value with its error in a readable unit.
-
-        Example:
-            >>> str(Parameter(32.9, 0.8, "s")), str(Parameter(15e-6, 0, "K"))
-            ('32.9(8) s', '15 uK (fixed)')
-            >>> str(Parameter(0.97, 0.01, "%")), str(Parameter(-4e3, 1e2, "%/s"))
-            ('97(1) %', '-400(10) %/ms')
-        """
-        unit, factor = readable(self.value, self.text_unit)
-        text = f"{Estimate(self.value, self.error).scaled(1 / factor)} {unit}".rstrip()
-        return text if self.error else f"{text} (fixed)"
-
-    def as_json(self) -> dict[str, Any]:
-        """JSON-ready, SI."""
-        return {"value": self.value, "error": self.error, "unit": self.unit}
-
-
-def readable(value: float, unit: str) -> tuple[str, float]:
-    """A unit in which an SI value is readable, and its factor to SI."""
-    dimension = dimension_of(unit)
-    if dimension and dimension != "fraction":
-        unit = readable_unit(value, dimension)
-        return unit, UNITS[dimension][unit]
-    numerator, _, denominator = unit.partition("/")
-    factor = 0.01 if numerator == "%" else 1.0
-    base, _, power = denominator.partition("^")
-    sizes = {
-        f"{numerator}/{denominator.replace(base, one)}": factor / size ** int(power or 1)
-        for one, size in UNITS.get(dimension_of(base) if base else "", {}).items()
-        if one not in ("min", "h")
-    }
-    if not sizes or not value:
-        return unit, factor
-    # the smallest number that is not below 1
-    best = min(sizes, key=lambda one: (abs(value) < sizes[one], abs(math.log10(abs(value) / sizes[one]))))
-    return best, sizes[best]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-from labseq.data.fits import Fit, Parameter
+from labseq.data.fits import Fit
+from labseq.data.numbers import Parameter
 from labseq.messages import clean
 from labseq.units import dimension_of, parse_any, split_quantity
 

@@ -4,34 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from labseq.data.best import best_point
-from labseq.data.fits import Fit, Parameter
+from labseq.data.fits import Fit
+from labseq.data.numbers import Parameter, Result
 from labseq.data.quantities import Quantity, measured_by, measures_of, quantity_of
 from labseq.data.reader import Run
 from labseq.data.scanned import FitAt, Scanned, fits_along, request_of, scanned
 from labseq.errors import ConfigError
 from labseq.model.estimate import Estimated, Rate
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """A number that a run has measured.
-
-    Attributes:
-        name: A fitted parameter, "decay", or a quantity, "survival:before,after".
-        value: Its value with error and unit.
-        at: The values of the other axes of the scan, as written; "" without any.
-    """
-
-    name: str
-    value: Parameter
-    at: str = ""
-
-    def __str__(self) -> str:
-        """Name and value, as a list of runs shows them."""
-        return f"{self.name} {self.value}" + (f" at {self.at}" if self.at else "")
 
 
 def results_of(run: Run) -> list[Result]:

@@ -10,6 +10,8 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from labseq.units import with_error
+
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
@@ -19,28 +21,8 @@ class Estimate:
     error: float
 
     def __str__(self) -> str:
-        """The value with the error of its last digit in brackets.
-
-        Example:
-            >>> str(Estimate(29.6142, 0.031)), str(Estimate(5988.0, 12.0)), str(Estimate(1.0, 0.0))
-            ('29.61(3)', '5990(10)', '1')
-            >>> str(Estimate(0.4, 0.096)), str(Estimate(7.123456, math.nan))
-            ('0.4(1)', '7.123')
-            >>> str(Estimate(99.555555555555543, 8e-15))  # rounding is not an error
-            '99.56'
-        """
-        if math.isnan(self.value):
-            return "-"
-        # A relative scatter below 1e-12 is only rounding.
-        if not math.isfinite(self.error) or self.error <= 1e-12 * abs(self.value):
-            return f"{self.value:.4g}"
-        digit = math.floor(math.log10(self.error))
-        if round(self.error / 10.0**digit) == 10:
-            digit += 1
-        error = round(self.error / 10.0**digit)
-        if digit >= 0:
-            return f"{round(self.value, -digit):.0f}({error * 10**digit})"
-        return f"{self.value:.{-digit}f}({error})"
+        """The value with the error of its last digit in brackets, ``29.61(3)``."""
+        return with_error(self.value, self.error)
 
     @property
     def interval(self) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import pytest
 
 import labseq
 from labseq.console.runs import folder_of_run
-from labseq.data import catalogue
+from labseq.data import described
 from labseq.recording import RunWriter
 from labseq.recording.notes import Notes, write_notes
 
@@ -90,8 +90,8 @@ def test_what_is_kept_of_a_run_follows_its_files(
     data: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("LABSEQ_CACHE", str(tmp_path / "cache"))
-    read, reader = list[str](), catalogue.read_entry
-    monkeypatch.setattr(catalogue, "read_entry", lambda folder: read.append(folder.name) or reader(folder))
+    read, reader = list[str](), described.read_entry
+    monkeypatch.setattr(described, "read_entry", lambda folder: read.append(folder.name) or reader(folder))
     two_minutes_ago = time.time() - 120
     folders = [folder for folder in data.glob("*/*") if (folder / "run.json").is_file()]
     for path in (path for folder in folders for path in (*folder.iterdir(), folder)):
@@ -107,6 +107,8 @@ def test_what_is_kept_of_a_run_follows_its_files(
     cache.write_bytes(b"damaged " * 1000)
     assert len([*labseq.runs()]) == 7
     assert [run.note for run in labseq.runs(where=["shots == 1"])] == ["later", ""]
+    for _ in range(2):  # the second time of what is kept
+        assert [run.note for run in labseq.runs(search="later")] == ["later"]
 
 
 @pytest.mark.parametrize(

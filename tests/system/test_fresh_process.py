@@ -67,6 +67,22 @@ print(*sorted(sys.modules))
     assert not {"h5py", "lmfit", "matplotlib", "pandas", "rich", "xarray"} & {*modules}
 
 
+def test_a_list_of_runs_that_are_kept_loads_no_numpy(tmp_path: Path) -> None:
+    """Which would take longer than the list of 10,000 runs."""
+    code = """
+import sys
+from labseq.cli import main
+try:
+    main(["runs", "--search", "lens"])
+except SystemExit as leaving:
+    assert not leaving.code
+print(*sorted(sys.modules))
+"""
+    modules = printed(code, cwd=tmp_path).splitlines()[-1].split()
+    assert "sqlite3" in modules
+    assert not {"h5py", "labseq.model", "numpy"} & {*modules}
+
+
 def test_the_core_is_what_a_virtual_run_loads(tmp_path: Path) -> None:
     """A reader of the core reads no more than this; it should become less (``poe structure``)."""
     files, _ = virtual_run(Path(labseq.__file__).parents[1], tmp_path)
