@@ -196,6 +196,11 @@ def _assembled(
         objects["planner"] = resolve(hardware.host, document, "planner", sequence.planner)
     steps, step_dumps = make_steps(hardware, document, sequence, problems)
     analyses, results = make_analyses(hardware, document, sequence, problems)
+    if sequence.measure or sequence.policy.checks or sequence.scan:
+        from labseq.assembly.quantities import readings_of  # loads what other runs do not need
+
+        is_known = is_whole and len(steps) == len(sequence.shot)
+        results = [*results, *readings_of(hardware, steps, is_whole=is_known)]
     # quantities may name regions, which a file with errors may have lost
     target = objects.get("target") if is_whole else None
     policy = make_policy(document, sequence, steps, results, target, problems)

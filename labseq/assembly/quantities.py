@@ -2,27 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Final
 
+from labseq.assembly.profile import ResolvedProfile
+from labseq.builtin.steps import ImageStep
 from labseq.config.document import Document
 from labseq.config.sequence import SequenceSpec
 from labseq.data.columns import QUANTITIES
 from labseq.data.quantities import quantity_problem
-from labseq.errors import Loc, ProblemCollector
+from labseq.errors import Loc, ProblemCollector, one_of
 from labseq.messages import clean, did_you_mean, listing
 from labseq.model import TargetPattern
 from labseq.model.image_quantities import OF_IMAGES, parse_name
 from labseq.model.records import unique_names
 from labseq.recording.folders import RESULT_PREFIX
-from labseq.roles import Step
+from labseq.recording.index import SIMULATION
+from labseq.roles import Hardware, Step
+from labseq.sequencer.clock import CLOCK_SET, SLEPT
 
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
 )
 """Quantities (results of a shot) that only shots with an image have."""
-_UNFORESEEN: Final = ("reading.", "stage.")
-"""Prefixes of quantities that depend on the shot."""
+_READING: Final = "reading."
+
+
+def readings_of(
+    hardware: ResolvedProfile, steps: Sequence[tuple[str, Step]], *, is_whole: bool
+) -> Iterator[str]:
+    """The readings that shots on a profile may have, by name; ending in "." if the rest is not known.
+
+    Args:
+        steps: The steps of a shot.
+        is_whole: Whether these are all, and no error in a file hides steps or devices.
+    """
+    if not is_whole or hardware.dry_run != "off":  # in a dry run others stand in for devices
+        yield _READING
+    for name, plugin in hardware.chosen.items():
+        if not plugin.entry.role.is_hardware:
+            continue
+        factory = plugin.entry.factory
+        polled: Collection[str] | None = getattr(plugin.settings, "polled", None)
+        if polled is not None:
+            yield from (f"{_READING}{name}.{value}" for value in polled)
+        elif not isinstance(factory, type) or getattr(factory, "poll", None) is not Hardware.poll:
+            yield f"{_READING}{name}."
+    if "simulation" in hardware.chosen:
+        yield f"{_READING}{SIMULATION}"
+    yield from (f"{_READING}{name}" for name in (SLEPT, CLOCK_SET))
+    for _, step in steps:
+        yield from (_READING + note for note in ("",) if step.notes is None)
+        yield from (_READING + note for note in step.notes or ())
 
 
 def check_quantity(
@@ -40,8 +71,8 @@ def check_quantity(
         place: Place of its name in the file.
         purpose: Its use: "to optimise".
         steps: The steps of a shot, or None if some have errors.
-        results: Names of the results of its analyses, "analysis.NAME.KEY"; "analysis.NAME." if its keys are
-            not known.
+        results: Names of its readings and of the results of its analyses, "analysis.NAME.KEY";
+            "analysis.NAME." if its keys are not known.
         target: The target; None if it has errors.
 
     Raises:
@@ -51,14 +82,23 @@ def check_quantity(
     images = [image for image, (_, step) in zip(names, steps or (), strict=True) if step.takes_image]
     unforeseen = [result for result in results if result.endswith(".")]
     known = [*QUANTITIES, *(result for result in results if result not in unforeseen)]
-    problem = quantity_problem(name, known, images, target, (*_UNFORESEEN, *unforeseen))
+    problem = quantity_problem(name, known, images, target, ("stage.", *dict.fromkeys(unforeseen)))
     if problem is not None:
         what, expected, hint = problem
+        if name.startswith(_READING):
+            readings = dict.fromkeys(one for one in results if one.startswith(_READING))
+            what = f"no device of the profile and no step gives '{clean(name)}'"
+            expected = one_of([f"{one}<name>" if one.endswith(".") else one for one in readings])
         raise document.error(place, f"{what} {purpose}", expected, _analysis_hint(name, results) or hint)
     needs_image = name in _JUDGED or parse_name(name).kind in OF_IMAGES
     if needs_image and steps is not None and not images:
         what = f"no shot has a {name}: it takes no image"
         raise document.error(place, what, "an 'image' step in the shot, or another quantity")
+    taken = [step for _, step in steps or () if step.takes_image]
+    # a step of a plugin may take several
+    if parse_name(name).kind == "survival" and len(taken) == 1 and isinstance(taken[0], ImageStep):
+        what = f"there is no '{clean(name)}' {purpose}: the shot has one image, '{clean(images[0])}'"
+        raise document.error(place, what, "two images, and survival from one to the other")
 
 
 def _analysis_hint(name: str, results: Iterable[str]) -> str:

@@ -323,6 +323,7 @@ class EqualiseStep(Step):
     takes_time = False
     device_setting = "device"
     device_may_be_camera = True
+    notes = (READINGS,)
 
     def __init__(self, settings: EqualiseSettings) -> None:
         self.settings = settings

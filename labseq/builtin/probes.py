@@ -64,6 +64,7 @@ class ProbeStep(Step):
     """
 
     needs_image = True
+    notes = ()
 
     def __init__(self, settings: ProbeSettings) -> None:
         self.settings = settings
@@ -153,6 +154,7 @@ class CheckSitesStep(Step):
     needs_image = True
     takes_time = False
     repeatable = True
+    notes = ("sites.",)
 
     def __init__(self, settings: CheckSitesSettings) -> None:
         self.settings = settings
@@ -239,6 +241,7 @@ class CheckOverlayStep(Step):
 
     needs_image = True
     takes_time = False
+    notes = ("overlay.",)
 
     def __init__(self, settings: CheckOverlaySettings) -> None:
         self.settings = settings

@@ -124,6 +124,8 @@ class PulseStep(Step):
     The lines that the profile turns on in the step `pulse` are on throughout.
     """
 
+    notes = ()
+
     def __init__(self, settings: PulseSettings) -> None:
         self.played = [pulse for pulse in settings.played() if pulse.duration_s]
         self.places = {pulse.place: pulse for pulse in settings.played()}

@@ -85,6 +85,7 @@ class RearrangeStep(Step):
     needs_target = True
     needs_image = True
     takes_image = True
+    notes = ()
 
     def __init__(self, settings: RearrangeSettings) -> None:
         self.settings = settings

@@ -40,6 +40,8 @@ class LoadSettings(Settings):
 class LoadStep(Step):
     """Lets atoms load for a time, into the static tweezers at the depth that they have."""
 
+    notes = ()
+
     def __init__(self, settings: LoadSettings) -> None:
         self.settings = settings
 
@@ -69,6 +71,7 @@ class ImageStep(Step):
 
     takes_image = True
     repeatable = True
+    notes = ()
 
     def __init__(self, settings: ImageSettings) -> None:
         self.settings = settings
@@ -101,6 +104,8 @@ class RampStep(Step):
     They keep it until the next ramp or the end of the shot: each shot begins at the nominal depth.
     """
 
+    notes = ()
+
     def __init__(self, settings: RampSettings) -> None:
         self.settings = settings
 
@@ -132,6 +137,8 @@ class ReleaseStep(Step):
 
     Either a line of the timing box turns them off, or their driver; where neither can, the step is refused.
     """
+
+    notes = ()
 
     def __init__(self, settings: ReleaseSettings) -> None:
         self.settings = settings
@@ -194,6 +201,7 @@ class DeviceStep(Step):
     repeatable = True
     takes_time = False
     device_setting = "name"
+    notes = ()
 
     def __init__(self, settings: DeviceSettings) -> None:
         self.settings = settings
@@ -259,6 +267,7 @@ class WaitStep(Step):
     """Lets time pass."""
 
     repeatable = True
+    notes = ()
 
     def __init__(self, settings: WaitSettings) -> None:
         self.duration_s = settings.duration or 0.0
@@ -279,6 +288,8 @@ class WaitStep(Step):
 
 class FollowStep(Step):
     """Waits for the start signal of another control system."""
+
+    notes = ()
 
     def __init__(self, signal: str, timeout_s: float, device: str = "") -> None:
         self.signal = signal

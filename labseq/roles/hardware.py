@@ -130,7 +130,10 @@ class Hardware(ABC):
         """
 
     def poll(self) -> Mapping[str, bool | int | float | str]:
-        """Read the values to record at the start of each shot; each becomes the reading "device.name"."""
+        """Read the values to record at the start of each shot; each becomes the reading "device.name".
+
+        If the driver's settings have a property ``polled`` with the names, a sequence cannot measure others.
+        """
         return {}
 
     def check_interlocks(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, ParamSpec, Protocol, TypeVar
@@ -409,6 +409,8 @@ class Step(ABC):
         windows_s: Longest time for the moves of each of its rearrangement cycles, in seconds; `labseq check`
             compares the planner's moves with them.
         judges_shot: Whether a shot whose last rearrangement it is needs no further image.
+        notes: Names of the readings that it records by :meth:`Shot.note`, or their beginnings up to a dot;
+            None if they are not known before the run. A sequence may measure what its steps note.
     """
 
     needs_image: bool = False
@@ -422,6 +424,7 @@ class Step(ABC):
     device = ""
     windows_s = tuple[float, ...]()
     judges_shot = False
+    notes: Collection[str] | None = None
 
     @abstractmethod
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:

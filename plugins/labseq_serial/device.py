@@ -277,7 +277,7 @@ class SerialDevice(Device):
 
     def poll(self) -> Mapping[str, Scalar]:
         """Read the values that are recorded with each shot."""
-        return {name: self.read(name) for name, value in self._settings.values.items() if value.poll}
+        return {name: self.read(name) for name in self._settings.polled}
 
     def check_interlocks(self) -> None:
         """Read the values that have an interlock, unless they were read just now.

@@ -259,6 +259,11 @@ class SerialSettings(Settings):
             return f"'{clean(text)}' is not {self.encoding}; expected another 'encoding', or other characters"
         return ""
 
+    @property
+    def polled(self) -> list[str]:
+        """Names of the values that are recorded with each shot."""
+        return [name for name, value in self.values.items() if value.poll]
+
     def identities(self) -> tuple[str, ...]:
         """What only one process can use of it."""
         if self.usb is None:

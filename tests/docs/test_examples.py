@@ -41,7 +41,8 @@ PROFILE = {
     "static_tweezers": "{use: virtual}",
     "mobile_tweezers": "{use: virtual}",
     "detector": "{use: threshold}",
-    "devices": "{shutter: {use: virtual}, synthesizer: {use: virtual_synthesizer}}",
+    "devices": "{shutter: {use: virtual}, synthesizer: {use: virtual_synthesizer}, laser: {use: serial, "
+    "port: simulated, write_ends_with: ';', read_ends_with: ';', values: {power_w: {ask: P, poll: true}}}}",
     "simulation": "{use: virtual}",
 }
 """What an example leaves out."""

@@ -147,10 +147,10 @@ def test_a_shot_that_is_gone_is_taken_again_at_its_point(tmp_path: Path) -> None
 
 def test_a_missing_quantity_is_one_warning_and_no_score(tmp_path: Path) -> None:
     seen = RecordingObserver()
-    over = OVER.replace("filling_fraction", "reading.laser.power_w")
+    over = OVER.replace("filling_fraction", "reading.simulation.power_w")
     run(tmp_path, f"use: scripted, dops: [3, 5], {over}, points: 2", observer=seen)
     (warning,) = [values["text"] for name, values in seen.events if name == "warning"]
-    assert warning.startswith("shot 0 has no 'reading.laser.power_w' to optimise")
+    assert warning.startswith("shot 0 has no 'reading.simulation.power_w' to optimise")
     points = [values for name, values in seen.events if name == "scan_point"]
     assert [(values["value"], values["best"]) for values in points] == [(None, None)] * 2
 

@@ -102,11 +102,51 @@ def test_some_sites_are_measured(tmp_path: Path) -> None:
             "5:28: 'report' without a fit; expected 'fit' as well",
         ),
         ("measure: [{value: analysis.x.y}]", "the sequence must list the analysis"),
+        (
+            "measure: [reading.camera.temperature]",
+            "5:11: no device of the profile and no step gives 'reading.camera.temperature' to measure",
+        ),
     ],
 )
 def test_a_mistake_is_named_with_its_place(tmp_path: Path, line: str, expected: str) -> None:
     text = HEAD + line + "\n" + SURVIVAL
     assert expected in message(tmp_path, text).replace(";  ", "; ")
+
+
+def test_survival_needs_two_images(tmp_path: Path) -> None:
+    text = HEAD + "measure: survival\nshot: [{load: {}}, {name: first, image: {}}]\n"
+    assert "5:10: there is no 'survival' to measure: the shot has one image, 'first'" in message(
+        tmp_path, text
+    )
+
+
+LASER = (
+    "devices={laser: {use: serial, port: simulated, write_ends_with: ';', read_ends_with: ';', values: "
+    "{power_w: {ask: 'P?', poll: true}, age: {ask: 'A?'}}}}"
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("reading.laser.power_w", ""),
+        ("reading.laser.age", "'reading.laser.power_w'"),
+        ("reading.overlay.error_m", ""),
+        ("reading.tweezers.noise", "'reading.overlay.<name>'"),
+    ],
+)
+def test_readings_are_those_of_devices_and_steps(tmp_path: Path, name: str, problem: str) -> None:
+    """A serial instrument says which values it records, and a step what it notes."""
+    shot = ARRAY + "  - check_overlay: {every: 2}\n"
+    path = tmp_path / "m.yaml"
+    path.write_text(HEAD + f"measure: {name}\n" + shot, "utf-8")
+    overrides = [*SMALL_FRAMES, f"profile.{LASER}"]
+    if not problem:
+        labseq.Session.open(path, output=tmp_path, overrides=overrides).close()
+        return
+    with pytest.raises(ConfigError) as error:
+        labseq.Session.open(path, output=tmp_path, overrides=overrides)
+    assert problem in str(error.value)
 
 
 @pytest.mark.parametrize(
