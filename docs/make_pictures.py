@@ -58,7 +58,7 @@ _FIRST_WEEK = {
     "release_recapture": f"{_SURVIVAL} --fit release_recapture",
     "transport_speed": "analysis.survival.survival --fit step",
     "hand_over_ramp": f"{_SURVIVAL} --fit gaussian --fit-set centre=0",
-    "parking": f"{_SURVIVAL} --fit plateau",
+    "parking": f"{_SURVIVAL} --fit plateau --fit-set offset=free",
 }
 
 PICTURES: Final = {

@@ -311,15 +311,18 @@ def _guess_step(x: Floats, y: Floats) -> dict[str, float]:
     return {"before": float(y[0]), "after": float(y[-1]), "centre": centre, "width": float(np.ptp(x)) / 8}
 
 
-def _plateau(x: Floats, amplitude: float, centre: float, half_width: float, edge: float) -> Floats:
-    return amplitude * _normal_cdf((half_width - np.abs(x - centre)) / edge)
+def _plateau(
+    x: Floats, amplitude: float, centre: float, half_width: float, edge: float, offset: float
+) -> Floats:
+    return offset + amplitude * _normal_cdf((half_width - np.abs(x - centre)) / edge)
 
 
 def _guess_plateau(x: Floats, y: Floats) -> dict[str, float]:
     high = x[y >= y.max() / 2]
     centre, half_width = float(np.ptp(high)) / 2 + float(high.min()), float(np.ptp(high)) / 2
     half_width = max(half_width, float(np.ptp(x)) / (len(x) - 1))
-    return {"amplitude": float(y.max()), "centre": centre, "half_width": half_width, "edge": half_width / 4}
+    values = {"amplitude": float(y.max()), "centre": centre, "half_width": half_width, "edge": half_width / 4}
+    return values | {"offset": 0.0}
 
 
 def _rising(y: Floats, x: Floats) -> tuple[Floats, Floats]:
@@ -522,10 +525,11 @@ MODELS: Final[Mapping[str, FitModel]] = {
         at_least={"width": 1e-12},
     ),
     "plateau": FitModel(
-        "amplitude within half_width of centre, falling to 0 as the integral of a Gaussian of s.d. edge",
-        {"amplitude": "y", "centre": "x", "half_width": "x", "edge": "x"},
+        "offset + amplitude within half_width of centre, falling as the integral of a Gaussian of s.d. edge",
+        {"amplitude": "y", "centre": "x", "half_width": "x", "edge": "x", "offset": "y"},
         _plateau,
         _guess_plateau,
+        {"offset": 0.0},
         at_least={"half_width": 0.0, "edge": 1e-12},
     ),
     "lowering": FitModel(
@@ -546,4 +550,4 @@ MODELS: Final[Mapping[str, FitModel]] = {
         0.02,  # its atoms are counted: smaller steps would see their number jump
     ),
 }
-"""The models that ``--fit`` offers. The offset of an exponential is fixed at 0 unless it is freed."""
+"""The models that ``--fit`` offers; offsets of exponentials and of a plateau are fixed at 0 unless freed."""

@@ -27,6 +27,8 @@ ROUNDING: Final = 1e-9
 """Relative error below which a value counts as without error."""
 MAX_ERROR: Final = 10.0
 """Largest error of a parameter, relative to its value or to the range of the points."""
+COMMON_FREEDOM: Final = 4.0
+"""Degrees of freedom with which the variance of all points counts in that of each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,11 +83,12 @@ class Fit:
             f"  {'chi-square'.ljust(width)}  {chi2} (reduced, {len(self.x)} points)",
         ]
 
-    def short_lines(self) -> list[str]:
-        """The result for the legend of a picture: what was fitted, and the reduced chi-square."""
-        chi2 = self.reduced_chi_square
-        last = [f"reduced chi-square {chi2:.2f}"] if math.isfinite(chi2) else []
-        return [self.model, *(f"{name} {parameter}" for name, parameter in self.free.items()), *last]
+    def caption(self) -> str:
+        """The result for a picture, without breaks in its numbers: model, parameters, chi-square."""
+        values = [f"{name} {parameter}" for name, parameter in self.free.items()]
+        if math.isfinite(self.reduced_chi_square):
+            values.append(f"reduced chi-square {self.reduced_chi_square:.2f}")
+        return f"fit {self.model}: " + ", ".join(value.replace(" ", "\xa0") for value in values)
 
     def as_json(self) -> dict[str, Any]:
         """The result, JSON-ready, SI."""
@@ -141,21 +144,50 @@ def fit_points(
 
 def _points(x: Sequence[float], values: Sequence[Estimated]) -> Points:
     rows = [
-        (at, value.value, (value.interval[1] - value.interval[0]) / 2, getattr(value, "n_trials", 0))
+        (
+            at,
+            value.value,
+            (value.interval[1] - value.interval[0]) / 2,
+            value.n if isinstance(value, Estimate) else 0,
+            0 if isinstance(value, Estimate) else value.n_trials,
+        )
         for at, value in zip(x, values, strict=True)
         if not math.isnan(value.value)
     ]
     if not rows:
         raise _problem("no point has a result", "shots that have this quantity")
-    at, y, error, n_trials = np.array(sorted(rows), np.float64).T
+    at, y, error, n_shots, n_trials = np.array(sorted(rows), np.float64).T
+    error = _moderated(error, n_shots)
     is_known = np.isfinite(error) & (error > ROUNDING * np.abs(y))
     if not is_known.any():
         if np.ptp(y) == 0:
             raise _problem("the quantity is the same at all points", "one that depends on the scanned value")
         return Points(at, y, np.ones_like(y), has_errors=False, n_trials=n_trials)
-    # a point without an error, such as one of a single shot, counts as the worst of the others
+    # a point without an error counts as the worst of the others
     error = np.where(is_known, error, error[is_known].max())
     return Points(at, y, error, has_errors=True, n_trials=n_trials)
+
+
+def _moderated(error: Floats, n_shots: Floats) -> Floats:
+    """The errors of means over a few shots, each drawn towards that of all points.
+
+    The scatter of two or five shots is a poor measure of their error: a point whose shots agree by chance
+    would get most of the weight, and the errors of the parameters would come out up to five times too small.
+    The variance of a point is averaged with that of all points, which counts as much as five shots of its
+    own (Smyth, Stat. Appl. Genet. Mol. Biol. 3, 3, 2004).
+
+    Args:
+        error: Standard errors of the points; nan for a single shot.
+        n_shots: Number of shots of each; 0 for a point that is not a mean.
+    """
+    is_known = n_shots > 1
+    if not is_known.any():
+        return error
+    freedom = np.maximum(n_shots - 1, 0)
+    variance = np.where(is_known, error**2 * n_shots, 0.0)
+    common = np.average(variance, weights=freedom)
+    moderated = (COMMON_FREEDOM * common + freedom * variance) / (COMMON_FREEDOM + freedom)
+    return np.where(n_shots > 0, np.sqrt(moderated / np.maximum(n_shots, 1)), error)
 
 
 def _solve_determined(

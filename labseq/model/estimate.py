@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Final, TypeAlias
 
@@ -15,10 +15,15 @@ from labseq.units import with_error
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A value with its standard error; NaN if one could not be determined."""
+    """A value with its standard error; NaN if one could not be determined.
+
+    Attributes:
+        n: Number of values that it is the mean of; 0 if it is not a mean.
+    """
 
     value: float
     error: float
+    n: int = field(default=0, compare=False, repr=False)
 
     def __str__(self) -> str:
         """The value with the error of its last digit in brackets, ``29.61(3)``."""
@@ -35,7 +40,7 @@ class Estimate:
 
     def scaled(self, factor: float) -> Estimate:
         """The same in another unit."""
-        return Estimate(self.value * factor, self.error * factor)
+        return Estimate(self.value * factor, self.error * factor, self.n)
 
 
 def mean(values: ArrayLike) -> Estimate:
@@ -50,7 +55,7 @@ def mean(values: ArrayLike) -> Estimate:
     if n == 0:
         return Estimate(math.nan, math.nan)
     error = float(array.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
-    return Estimate(float(array.mean()), error)
+    return Estimate(float(array.mean()), error, n)
 
 
 ONE_SIGMA: Final = math.erf(math.sqrt(0.5))

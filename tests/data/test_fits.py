@@ -13,7 +13,7 @@ import pytest
 from labseq.data.fit_models import MODELS
 from labseq.data.fits import Fit, fit_points
 from labseq.errors import ConfigError
-from labseq.model.estimate import Estimate, Estimated, Rate
+from labseq.model.estimate import Estimate, Estimated, Rate, mean
 
 TRAP = {"static_depth": 300e-6, "static_waist": 0.98e-6, "static_wavelength": 808e-9}
 TRUTH = {
@@ -31,7 +31,7 @@ TRUTH = {
     "linear": {"slope": -3.0, "intercept": 0.7},
     "saturation": {"level": 0.8, "time": 0.03},
     "step": {"before": 0.95, "after": 0.1, "centre": 0.04, "width": 0.01},
-    "plateau": {"amplitude": 0.9, "centre": 0.04, "half_width": 0.02, "edge": 0.005},
+    "plateau": {"amplitude": 0.9, "centre": 0.04, "half_width": 0.02, "edge": 0.005, "offset": 0.05},
     "lowering": {"temperature": 15e-6, "amplitude": 0.98},
     "release_recapture": {"temperature": 25e-6, "amplitude": 0.98},
 }
@@ -59,7 +59,7 @@ def fitted(
 
 @pytest.mark.parametrize("model", MODELS)
 def test_each_model_finds_its_parameters_from_its_own_starting_values(model: str) -> None:
-    found = fitted(model, given={"offset": "free"} if model == "exponential" else {})
+    found = fitted(model, given={"offset": "free"} if model in ("exponential", "plateau") else {})
     for name, true in TRUTH[model].items():
         one = found.parameters[name]
         assert abs(one.value - true) < 3 * one.error < 0.5 * abs(true)
@@ -183,6 +183,20 @@ def test_the_errors_cover_the_truth_as_often_as_they_should(
         assert len(values) > 0.9 * seeds, name  # the others showed no decay
         assert 0.55 < np.mean(np.abs(values) < 1) < 0.8, name
         assert abs(np.median(values)) < 0.4, name
+
+
+@pytest.mark.parametrize("n_shots", [2, 5])
+def test_shots_that_agree_by_chance_do_not_shrink_the_errors(n_shots: int) -> None:
+    """The filling of 400 sites, as the mean of a few shots at each point."""
+    x, truth = np.array([10.0, 20, 40, 60, 100, 150, 250, 500]), 50.0
+    rng, p = np.random.default_rng(1), 0.75 * (1 - np.exp(-x / truth))
+    deviations: list[float] = []
+    for _ in range(120):
+        values = [mean(rng.binomial(400, at, n_shots) / 400) for at in p]
+        time = fit_points("saturation", x.tolist(), values, ("ms", "%")).parameters["time"]
+        deviations.append((time.value - truth) / time.error)
+    assert 0.55 < np.mean(np.abs(deviations) < 1) < 0.8
+    assert max(map(abs, deviations)) < 5
 
 
 def rates(x: Any, p: Any, n: int, seed: int = 0) -> tuple[list[float], list[Rate]]:
