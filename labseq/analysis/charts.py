@@ -169,7 +169,6 @@ def draw_curves(
     from_zero: bool = False,
     scale: float = 100.0,
     line: Callable[[Floats], Floats] | None = None,
-    line_label: str = "",
 ) -> None:
     """Draw values with error bars, by default fractions in per cent.
 
@@ -190,7 +189,7 @@ def draw_curves(
     if line is not None:
         across = np.geomspace if logarithmic else np.linspace
         x = across(all_x.min(), all_x.max(), 200)
-        axes.plot(x, scale * line(x), color=ORANGE, linewidth=1.2, label=line_label, zorder=2)
+        axes.plot(x, scale * line(x), color=ORANGE, linewidth=1.2, zorder=2)
     if logarithmic:
         _plain_logarithmic(axes)
     elif ticks:
@@ -205,7 +204,7 @@ def draw_curves(
         axes.set_xlim(all_x.min() - 0.5, all_x.max() + 0.5)
     low, high = _with_room(scale * np.concatenate(ends), 0.12, MIN_RANGE_PERCENT / 2 if scale == 100 else 0.0)
     axes.set_ylim(0.0 if from_zero else low, high)
-    if len(curves) > 1 or line is not None:
+    if len(curves) > 1:
         axes.legend()
 
 

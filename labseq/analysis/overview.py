@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -69,6 +70,8 @@ MAX_PANELS: Final = 2
 """Maximum number of panels of a scan in a row."""
 PANEL_IN: Final = (3.7, 3.1)
 """Width and height of a panel in inches."""
+X_LABEL_WIDTH: Final = 50
+"""Maximum length of a line below a panel, in characters."""
 TITLE_IN: Final = 0.55
 
 
@@ -282,14 +285,18 @@ def _scan_curve(
         )
     values, unit = numbers
     rows = sorted(zip(values, means, strict=True), key=lambda row: row[0])
+    below = [f"{axis.address} ({unit})" if unit else axis.address]
+    if fit is not None:  # a legend would hide points: those of an oscillation are everywhere
+        below.append(fit.caption())
     return partial(
         draw_curves,
         title=title,
-        x_label=f"{axis.address} ({unit})" if unit else axis.address,
+        x_label="\n".join(
+            line for text in below for line in textwrap.wrap(text, X_LABEL_WIDTH, break_on_hyphens=False)
+        ),
         curves={"": points_of([x for x, _ in rows], [y for _, y in rows])},
         logarithmic=is_geometric(sorted({*values})),
         line=None if fit is None else partial(_fitted, fit, factor_of(unit)),
-        line_label="" if fit is None else "\n".join(fit.short_lines()),
         **common,
     )
 

@@ -117,7 +117,8 @@ class ScanReport:
             )
             for i, (point_values, point) in enumerate(zip(written, self.scan.points, strict=True))
         ]
-        return aligned([header, *rows], right=range(len(header)), most=most)
+        n_scanned = len(self.scan.points[0].written)
+        return aligned([header, *rows], right=range(len(header)), most=most, keys=n_scanned)
 
     def _map(self, quantity: Quantity, values: Sequence[Estimated]) -> list[str]:
         down, across = self.scan.axes

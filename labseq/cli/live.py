@@ -22,6 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from labseq.analysis.scanned import shown_unit, title_of, value_text
+from labseq.cli.live_fits import LiveFits
 from labseq.console.arrays import Glyphs, draw_array, glyphs_for, scales
 from labseq.console.events import LASTING, LogLines, best_text, event_text, scanned_names
 from labseq.console.text import clock_time, count_of, plural
@@ -206,6 +207,7 @@ class Tally:
         stages: Stage -> its durations.
         scan: The points of the scan; None without one.
         measured: The quantities that the run measures, the most important first.
+        fits: Their fits against the scanned value; None without a scan.
         best: The best point of an adaptive scan so far, as text, or "".
         status: Final status of the run, or "".
     """
@@ -220,6 +222,7 @@ class Tally:
         self.stages = {name: StageTally() for name in STAGES}
         self.scan: ScanTally | None = None
         self.measured: list[Series] = []
+        self.fits: LiveFits | None = None
         self.best = ""
         self.status = ""
 
@@ -269,6 +272,7 @@ class Tally:
         if not self.measured:
             names = names_measured(record.resolved, record.target)
             self.measured = [Series(make_quantity(name, record.target), run_dir) for name in names]
+            self.fits = LiveFits(run_dir, record.resolved, self.measured) if record.scan else None
 
     def _count(self, row: IndexRow) -> None:
         if not row.counts:
@@ -283,9 +287,11 @@ class Tally:
             measured.add(row)
 
     def look(self) -> None:
-        """Add the results of analyses that have come."""
+        """Add the results of analyses that have come, and fit what has points."""
         for measured in self.measured:
             measured.read_results()
+        if self.fits is not None and self.scan is not None:
+            self.fits.look(self.scan.lines, at_once=bool(self.status))
 
 
 SIDE_WIDTH: Final = 48
@@ -401,6 +407,8 @@ def _results(tally: Tally) -> Table:
         if measured.quantity.name != "defect_free":
             value = value_text(measured.mean, measured.quantity, short=True)
             table.add_row(title_of(measured.quantity), value)
+        if tally.fits is not None and measured.quantity.name in tally.fits.results:
+            table.add_row(*tally.fits.results[measured.quantity.name])
     if tally.best:
         table.add_row("best so far", Text(tally.best))
     if tally.n_repeated:

@@ -188,7 +188,7 @@ class Summary:
             *_skipped_rows(self.skipped_shots),
             *_best_rows(self.best),
             *(statistics_rows(self.statistics) if self.has_target else _atom_rows(self.n_atoms)),
-            *_measured_rows(self.measured),
+            *_measured_rows(self.measured, is_judged=_is_judged(self.statistics)),
             *((clean(name), value) for name, value in self.results),
             *_time_rows(self.simulated_time_s, self.wall_time_s),
             *(("watchdog", one_line(line)) for line in self.watchdog),
@@ -240,9 +240,12 @@ def _atom_rows(n_atoms: Sequence[Estimate]) -> Facts:
     return [("target", "none"), *([("atoms", ", ".join(texts))] if texts else [])]
 
 
-def _measured_rows(measured: Sequence[tuple[Quantity, Estimated]]) -> Facts:
-    """What a run measures over all its shots; what has rows of its own is left out."""
-    own = (one for one in measured if one[0].name not in WITH_TARGET)
+def _measured_rows(measured: Sequence[tuple[Quantity, Estimated]], *, is_judged: bool) -> Facts:
+    """What a run measures over all its shots; what has rows of its own is left out.
+
+    Of shots that are not judged, the filling of their last image is told here.
+    """
+    own = (one for one in measured if one[0].name not in (WITH_TARGET if is_judged else WITH_TARGET[1:]))
     return [(title_of(quantity), value_text(mean, quantity)) for quantity, mean in own]
 
 
@@ -266,18 +269,22 @@ def cycle_table(statistics: Statistics | None) -> list[str]:
     return [*table(statistics.cycles, CYCLES), f"each cycle is judged on its own final image{reached}"]
 
 
+def _is_judged(results: Statistics | None) -> bool:
+    return results is not None and bool(results.defect_free.n_trials)
+
+
 def statistics_rows(results: Statistics | None) -> Facts:
     """The results of the shots: name and value of each line."""
     if results is None:
         return []
-    is_judged = bool(results.defect_free.n_trials)
+    is_judged = _is_judged(results)
     rows = [
         (
             "defect-free",
             counted_text(results.defect_free) if is_judged or not results.n_shots else NOT_JUDGED,
         ),
         ("seen defect-free", count_of(results.seen.n, results.seen.n_trials)),
-        ("filling", share_text(results.filling)),
+        *([("filling", share_text(results.filling))] if is_judged else []),
     ]
     if results.defects:
         rows.append(("defects", histogram_text(results.defects)))

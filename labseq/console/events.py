@@ -215,10 +215,15 @@ def point_of_shot(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, A
 
 
 def scanned_names(scan: Mapping[str, Any]) -> list[str]:
-    """The ends of the scanned addresses: "window"; the addresses themselves if two have the same end."""
+    """The ends of the scanned addresses: "window", "offset.0"; the addresses if two have the same end."""
     addresses = [clean(str(address)) for address in scan.get("addresses", ())]
-    names = [address.rpartition(".")[2] for address in addresses]
+    names = [*map(_end, addresses)]
     return names if len({*names}) == len(names) else addresses
+
+
+def _end(address: str) -> str:
+    head, _, last = address.rpartition(".")
+    return f"{_end(head)}.{last}" if head and last.isdecimal() else last
 
 
 def scanned_values(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, Any]) -> list[str]:

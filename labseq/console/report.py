@@ -85,17 +85,20 @@ def table(rows: Iterable[Row], columns: Sequence[Column[Row]], most: int = 0) ->
     return aligned([[column.heading for column in columns], *cells], right, most)
 
 
-def aligned(rows: Sequence[Sequence[str]], right: Sequence[int] = (), most: int = 0) -> list[str]:
+def aligned(
+    rows: Sequence[Sequence[str]], right: Sequence[int] = (), most: int = 0, keys: int = 1
+) -> list[str]:
     """Lay out rows of text in columns two spaces apart.
 
     Where stdout is a terminal that is too narrow for the table, texts are wrapped between words; columns
-    that still do not fit follow in a second table. A word that is wider than the terminal, such as a path,
-    stays whole. In a pipe or a file every row stays one line.
+    that still do not fit follow in a second table, behind the first ``keys`` columns. A word that is wider
+    than the terminal, such as a path, stays whole. In a pipe or a file every row stays one line.
 
     Args:
         rows: The cells; all rows have the same number of them.
         right: Indices of the columns that are aligned on the right; below the header they are not wrapped.
         most: Maximum number of rows below the header, 0 for all; the middle ones are left out.
+        keys: Number of columns that tell the rows apart.
 
     Example:
         >>> aligned([["image", "45 ms"], ["load", "500 ms"]], right=[1])
@@ -110,8 +113,10 @@ def aligned(rows: Sequence[Sequence[str]], right: Sequence[int] = (), most: int 
     if not room or _total(widths) <= room:
         return _lines(table, right, widths)
     least = [_least(column, i in right) for i, column in enumerate(table)]
+    while keys > 1 and _total([*least[:keys], _MIN_WIDTH]) > room:
+        keys -= 1
     n_fit = len(least)
-    while n_fit > 2 and _total(least[:n_fit]) > room:
+    while n_fit > keys + 1 and _total(least[:n_fit]) > room:
         n_fit -= 1
     least[n_fit - 1] = min(least[n_fit - 1], max(_MIN_WIDTH, room - _total([*least[: n_fit - 1], 0])))
     widths = widths[:n_fit]
@@ -121,8 +126,10 @@ def aligned(rows: Sequence[Sequence[str]], right: Sequence[int] = (), most: int 
     lines = _lines(table[:n_fit], right, widths)
     if n_fit == len(table):
         return lines
-    rest = [0, *range(n_fit, len(table))]
-    others = aligned([[row[i] for i in rest] for row in rows], [k for k, i in enumerate(rest) if i in right])
+    rest = [*range(keys), *range(n_fit, len(table))]
+    others = aligned(
+        [[row[i] for i in rest] for row in rows], [k for k, i in enumerate(rest) if i in right], keys=keys
+    )
     return [*lines, "", *others]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from labseq.console.events import LogLines, event_text
+from labseq.console.events import LogLines, event_text, scanned_names
 from labseq.recording.results import ResultsLog, results_file
 
 
@@ -95,3 +95,10 @@ def test_a_shot_that_was_interrupted_needs_no_reason(fake: Any) -> None:
     scan = {"addresses": ["a.b", "c.d"], "written": [["5 ms", "7"]], "point_of_shot": [0]}
     text = event_text("shot_finished", {"row": row}, replace(fake.run(), scan=scan))
     assert text == "shot 0  b 5 ms, d 7  interrupted"
+
+
+def test_a_scanned_address_is_named_by_its_end() -> None:
+    ends = {"shot.probe.offset.0": "offset.0", "planner.degree_of_parallelism": "degree_of_parallelism"}
+    assert scanned_names({"addresses": list(ends)}) == list(ends.values())
+    same = ["shot.2.rearrange.window", "shot.4.rearrange.window"]
+    assert scanned_names({"addresses": same}) == same

@@ -55,7 +55,7 @@ def test_success_and_what_was_only_seen_stand_apart() -> None:
 
 def test_shots_that_are_not_judged_are_said_not_to_be() -> None:
     printed = lines(defect_free=Rate(0, 0), filling=UNKNOWN, defects=())
-    assert (printed["defect-free"], printed["filling"]) == (NOT_JUDGED, "-")
+    assert printed["defect-free"] == NOT_JUDGED
     assert printed["defects"] == "none in 1, 1 in 4, 2 in 15 shots, after 1 cycle"
 
 
@@ -63,7 +63,7 @@ def test_no_shots_are_no_reason_to_complain() -> None:
     printed = lines(
         n_shots=0, defect_free=Rate(0, 0), seen=Rate(0, 0), filling=UNKNOWN, cycles=(), defects=()
     )
-    assert printed == {"defect-free": "0 of 0", "seen defect-free": "0 of 0", "filling": "-"}
+    assert printed == {"defect-free": "0 of 0", "seen defect-free": "0 of 0"}
 
 
 def test_the_truth_of_a_simulation_is_reported() -> None:

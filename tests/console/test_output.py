@@ -45,6 +45,31 @@ def test_a_table_that_is_too_wide_for_the_terminal_is_wrapped(monkeypatch: pytes
     assert all(line.startswith((" " * 12, "name", "camera  12")) for line in lines)
 
 
+def test_rows_that_several_columns_tell_apart_keep_them_in_a_second_table(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rows = [
+        ("degree", "speed", "shots", "filling", "defects"),
+        ("15", "130 um/ms", "5", "97.3 %", "6"),
+        ("15", "355 um/ms", "5", "57.0 %", "97"),
+    ]
+    monkeypatch.setenv("COLUMNS", "30")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    assert aligned(rows, right=range(5), keys=2) == [
+        "degree      speed  shots",
+        "    15  130 um/ms      5",
+        "    15  355 um/ms      5",
+        "",
+        "degree      speed  filling",
+        "    15  130 um/ms   97.3 %",
+        "    15  355 um/ms   57.0 %",
+        "",
+        "degree      speed  defects",
+        "    15  130 um/ms        6",
+        "    15  355 um/ms       97",
+    ]
+
+
 def test_say_prints_whole_lines() -> None:
     stream = io.StringIO()
     say("a", "b", stream=stream)
