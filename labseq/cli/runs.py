@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -43,9 +42,7 @@ COLUMNS: Final[Sequence[Column[RunEntry]]] = (
     Column("run", lambda run: visible(run.number)),
     Column("began", lambda run: _local_time(run.t_start_utc)),
     Column("name", lambda run: visible(run.name or run.path.name)),
-    Column(
-        "scanned", lambda run: clean("; ".join(f"{_short(a)} {v}" for a, v in run.scanned.items()) or "-")
-    ),
+    Column("scanned", lambda run: clean(run.scanned_text) or "-"),
     Column("measured", lambda run: clean(str(run.results[0])) if run.results else "-"),
     Column("shots", lambda run: "-" if run.shots is None else _shots(run), right=True),
     Column("state", lambda run: run.status),
@@ -55,16 +52,6 @@ COLUMNS: Final[Sequence[Column[RunEntry]]] = (
 
 def _shots(run: RunEntry) -> str:
     return f"{run.shots} of {run.n_shots}"
-
-
-def _short(address: str) -> str:
-    """An address without what most have in common.
-
-    Example:
-        >>> _short("shot.hold.duration"), _short("profile.mobile_tweezers.speed")
-        ('hold.duration', 'mobile_tweezers.speed')
-    """
-    return re.sub(r"^(shot|profile)\.", "", address)
 
 
 @dataclass(frozen=True, slots=True)

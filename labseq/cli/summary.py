@@ -22,9 +22,9 @@ from labseq.analysis.scanned import (
 from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_of
 from labseq.console.errors import lines_of
 from labseq.console.report import Column, Facts, aligned, table
-from labseq.console.text import count_of, plural, quoted
+from labseq.console.text import count_of, percent, plural, quoted
 from labseq.data import Run
-from labseq.data.best import BestPoint, best_point
+from labseq.data.best import BestPoint, BestShot, best_point, best_shot
 from labseq.data.follower import Follower
 from labseq.data.quantities import WITH_TARGET, Quantity, measured_by, quantity_of
 from labseq.data.scanned import scanned
@@ -80,6 +80,7 @@ class Summary:
         scan: What the run measures at each point of the scan, with its fits.
         results: Name and value of what the sequence asks the fits for.
         best: The best point of an adaptive scan.
+        best_shot: The shot that came nearest to the target.
         simulated_time_s: Time that the shots took in a simulated run.
         wall_time_s: Time on the computer's clock until the end of the last shot; of a resumed run, of all
             its parts together.
@@ -112,6 +113,7 @@ class Summary:
     scan: ScanReport | None = None
     results: Sequence[tuple[str, str]] = ()
     best: BestPoint | None = None
+    best_shot: BestShot | None = None
     simulated_time_s: float = math.nan
     wall_time_s: float = math.nan
     watchdog: Sequence[str] = ()
@@ -147,6 +149,7 @@ class Summary:
             scan=scan,
             results=results_of(run, scan) if scan else (),
             best=best_point(run),
+            best_shot=best_shot(run),
             simulated_time_s=sum(shot.row.duration_s for shot in run.shots) if run.simulated else math.nan,
             wall_time_s=_wall_time_s(run),
             watchdog=watchdog_lines(run.path),
@@ -188,6 +191,7 @@ class Summary:
             *_skipped_rows(self.skipped_shots),
             *_best_rows(self.best),
             *(statistics_rows(self.statistics) if self.has_target else _atom_rows(self.n_atoms)),
+            *(_best_shot_rows(self.best_shot) if self.shots > 1 else []),
             *_measured_rows(self.measured, is_judged=_is_judged(self.statistics)),
             *((clean(name), value) for name, value in self.results),
             *_time_rows(self.simulated_time_s, self.wall_time_s),
@@ -217,6 +221,15 @@ def _best_rows(best: BestPoint | None) -> Facts:
     suggested = ", ".join(f"{clean(address)} {value}" for address, value in best.suggested.items())
     source = "a parabola through the points near it" if best.is_fitted else "no parabola fits: the best point"
     return [("best point", f"{at}: {value}"), ("suggested", f"{suggested} ({source})")]
+
+
+def _best_shot_rows(best: BestShot | None) -> Facts:
+    """The shot to look at first: its number, and how near to the target it came."""
+    if best is None:
+        return []
+    filled = "defect-free" if best.success else f"{percent(best.filling)} filled"
+    cycles, duration = plural(best.n_cycles, "cycle"), format_quantity(best.duration_s, "time")
+    return [("best shot", f"{best.shot}: {filled} after {cycles}, {duration}")]
 
 
 def _resumed(run: Run) -> list[str]:

@@ -1,4 +1,4 @@
-"""The best point of an adaptive scan, and the value that a parabola through the points near it suggests."""
+"""The best shot of a run; the best point of an adaptive scan, and what a parabola suggests."""
 
 from __future__ import annotations
 
@@ -48,6 +48,43 @@ class BestPoint:
             "shots": len(self.point.shots),
             "suggested": dict(self.suggested),
         }
+
+
+@dataclass(frozen=True, slots=True)
+class BestShot:
+    """The shot that came nearest to the target.
+
+    Attributes:
+        shot: Its index.
+        success: Whether it met the target on its last image; None if that cannot be told.
+        filling: Fraction of the target's sites that held an atom on its last image.
+        n_cycles: Number of rearrangement cycles that it took.
+        duration_s: Sum of its steps.
+    """
+
+    shot: int
+    success: bool | None
+    filling: float
+    n_cycles: int
+    duration_s: float
+
+
+def best_shot(run: Run) -> BestShot | None:
+    """A shot that met the target, else the fullest; of equal ones that with the fewest cycles.
+
+    Returns:
+        None for a run without a target, or of which no shot could be judged.
+    """
+    judged = [
+        BestShot(row.shot, row.success, row.filling_fraction, row.n_cycles, row.duration_s)
+        for row in (shot.row for shot in run.shots)
+        if not math.isnan(row.filling_fraction)
+    ]
+
+    def rank(one: BestShot) -> tuple[float, ...]:
+        return not one.success, -one.filling, one.n_cycles, one.duration_s, one.shot
+
+    return min(judged, key=rank, default=None)
 
 
 def best_point(run: Run) -> BestPoint | None:

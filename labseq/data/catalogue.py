@@ -118,13 +118,11 @@ def entries(root: Path, names: Iterable[tuple[str, str]], words: Sequence[str] =
         names: Day and name of each run.
         words: Only entries whose text contains all of these, in lower case.
     """
-    cache = _cache_file(root)
-    kept, new = _read_kept(cache), dict[str, Kept]()
+    connection, new = _connected(root), dict[str, Kept]()
     try:
         for day, name in names:
             folder, key = f"{root}/{day}/{name}", f"{day}/{name}"
-            stamp, before = _stamp(folder), kept.get(key)
-            entry = None
+            stamp, before, entry = _stamp(folder), _kept(connection, key), None
             if before is not None and before.stamp == stamp:
                 if not _contains(before.text, words):
                     continue
@@ -138,7 +136,7 @@ def entries(root: Path, names: Iterable[tuple[str, str]], words: Sequence[str] =
             if _contains(entry.text, words):
                 yield entry
     finally:
-        _keep(cache, new)
+        _keep(connection, new)
 
 
 def _contains(text: str, words: Sequence[str]) -> bool:
@@ -181,40 +179,42 @@ def _decoded(folder: str, text: str) -> RunEntry | None:
         return None
 
 
-def _cache_file(root: Path) -> Path | None:
-    """The file for a data folder; None for a user without a home."""
+def _connected(root: Path) -> sqlite3.Connection | None:
+    """The file of a data folder's entries; None for a user without a home, room or permission."""
     digest = hashlib.sha256(str(root.resolve()).encode("utf-8", "surrogateescape")).hexdigest()
-    try:
-        return cache_root() / "runs" / f"{digest[:16]}.sqlite"
-    except RuntimeError:
+    columns = "name text primary key, stamp text, text text, entry text"
+    with suppress(RuntimeError, OSError, sqlite3.OperationalError):
+        file = cache_root() / "runs" / f"{digest[:16]}.sqlite"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        connection = sqlite3.connect(file, isolation_level=None)
+        try:
+            connection.execute("pragma synchronous = off")  # after a power cut the runs are read again
+            connection.execute(f"create table if not exists runs_2 ({columns})")
+            return connection
+        except sqlite3.DatabaseError as error:
+            connection.close()
+            if not isinstance(error, sqlite3.OperationalError):  # it is damaged; the next list makes it again
+                file.unlink()
+    return None
+
+
+def _kept(connection: sqlite3.Connection | None, name: str) -> Kept | None:
+    """What is kept of a run."""
+    if connection is None:
         return None
+    with suppress(sqlite3.Error):
+        rows = connection.execute("select stamp, text, entry from runs_2 where name = ?", (name,))
+        return next(map(Kept._make, rows.fetchall()), None)
+    return None
 
 
-def _read_kept(cache: Path | None) -> dict[str, Kept]:
-    """What is kept of the runs in a data folder, by day and name."""
-    if cache is None or not cache.is_file():
-        return {}
-    try:
-        with closing(sqlite3.connect(cache)) as connection:
-            rows = connection.execute("select * from runs_2")
-            return {name: Kept(*columns) for name, *columns in rows}
-    except sqlite3.OperationalError:  # another process writes, or has made the file and not yet the table
-        return {}
-    except sqlite3.DatabaseError:  # it is damaged
-        with suppress(OSError):
-            cache.unlink()
-        return {}
-
-
-def _keep(cache: Path | None, new: Mapping[str, Kept]) -> None:
-    """Keep new entries; without a folder, room or permission for them they are read again next time."""
-    if cache is None or not new:
+def _keep(connection: sqlite3.Connection | None, new: Mapping[str, Kept]) -> None:
+    """Keep new entries, and close the file; what cannot be kept is read again next time."""
+    if connection is None:
         return
-    with suppress(OSError, sqlite3.Error):
-        cache.parent.mkdir(parents=True, exist_ok=True)
-        with closing(sqlite3.connect(cache)) as connection, connection:
-            connection.execute(
-                "create table if not exists runs_2 (name text primary key, stamp text, text text, entry text)"
-            )
+    with suppress(sqlite3.Error), closing(connection):
+        if new:
+            connection.execute("begin")
             rows = [(name, *kept) for name, kept in new.items()]
             connection.executemany("insert or replace into runs_2 values (?, ?, ?, ?)", rows)
+            connection.execute("commit")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -71,6 +72,12 @@ class RunEntry:
     def number(self) -> str:
         """The shortest name that is its own: "2026-11-20/75"."""
         return f"{self.path.parent.name}/{counter_of(self.path.name)}"
+
+    @property
+    def scanned_text(self) -> str:
+        """What it scanned, in a line: "hold.duration 1 ms to 20 ms, 8 values"."""
+        short = (re.sub(r"^(shot|profile)\.", "", address) for address in self.scanned)
+        return "; ".join(map(" ".join, zip(short, self.scanned.values(), strict=True)))
 
     @property
     def values(self) -> dict[str, Any]:

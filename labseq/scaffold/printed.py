@@ -42,6 +42,7 @@ OUTCOMES: Final[Mapping[str, str]] = {
     "skipped": "shots that are not taken, and why: a policy, or a point at which a device failed",
     "resumed": "where the run went on, and how it had ended before",
     "ended early": "why the run ended by itself before its last shot, without an error",
+    "best shot": "a shot that met the target, else the fullest; of equal ones that with the fewest cycles",
     "best point": "the point of an adaptive scan with the best value so far",
     "suggested": "the maximum or minimum of a parabola through the points near the best one",
     "lost in a shot": "atoms lost, by cause, on average; only a simulation knows them",

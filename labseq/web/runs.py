@@ -15,6 +15,7 @@ from threading import Lock
 from typing import Any, Final, cast
 
 from labseq.data import Run, Shot
+from labseq.data.catalogue import entries
 from labseq.data.follower import Event, Follower
 from labseq.data.points import reporting_damage
 from labseq.data.quantities import WITH_TARGET, make_quantity, names_measured, quantity_problem
@@ -249,8 +250,19 @@ class Catalogue:
             return cached[1]
         run = self._open.get(str(folder))
         values = _summary(OpenRun(folder) if run is None or run.follower.is_replaced() else run)
+        values |= self._results(folder) if values["status"] != "running" else {"scanned": "", "results": []}
         self._summaries[folder] = (stamp, values)
         return values
+
+    def _results(self, folder: Path) -> dict[str, Any]:
+        """What a run that has ended scanned and measured, as `labseq runs` shows it."""
+        entry = next(entries(self.root, [(folder.parent.name, folder.name)]))
+        return {
+            "scanned": text_of(entry.scanned_text, 400),
+            "results": [
+                {"name": text_of(one.name, 200), "text": text_of(one, 400)} for one in entry.results[:5]
+            ],
+        }
 
     def warm(self) -> None:
         """Read all runs for the list once, the newest first, at a pace that leaves room for answers."""
@@ -307,6 +319,7 @@ def _matches(summary: Mapping[str, Any], words: Iterable[str]) -> bool:
     keys = ("id", "name", "profile", "status", "outcome", "comment", "started_utc", "error")
     text = " ".join(str(summary[key] or "") for key in keys).lower()
     text += " ".join(summary["tags"]).lower() + (" simulated" if summary["simulated"] else "")
+    text += " ".join([summary["scanned"], *(one["text"] for one in summary["results"])]).lower()
     return all(word in text for word in words)
 
 

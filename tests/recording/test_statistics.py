@@ -14,6 +14,7 @@ import pytest
 
 from labseq.analysis.statistics import statistics_of
 from labseq.data import Run, open_run
+from labseq.data.best import best_shot
 from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, ShotRecord
 from labseq.model.estimate import Rate
 from labseq.plain import to_plain
@@ -118,6 +119,17 @@ def test_shots_that_ended_early_leave_later_cycles_to_the_others(of_defects: Any
     assert found.defect_free == Rate(1, 3)
     assert found.seen == Rate(2, 3)
     assert found.defects == (1, 1, 0, 1)
+
+
+def test_the_best_shot_met_the_target_with_the_fewest_cycles(of_defects: Any, recorded: Any) -> None:
+    nearly = [of_defects(0, (2,), last=2), of_defects(1, (1, 1), last=1), of_defects(2, (0,))]
+    best = best_shot(recorded(*nearly))
+    assert best is not None
+    assert (best.shot, best.success, best.filling) == (1, False, pytest.approx(5 / 6))
+    best = best_shot(recorded(*nearly, of_defects(3, (2, 0), last=0), of_defects(4, (0,), last=0)))
+    assert best is not None
+    assert (best.shot, best.success, best.n_cycles) == (4, True, 1)
+    assert best_shot(recorded(of_defects(0, (0,)))) is None  # nothing was judged
 
 
 def test_a_surplus_atom_is_no_success(of_defects: Any, recorded: Any) -> None:

@@ -230,6 +230,9 @@ def test_a_run_of_the_shipped_lifetime_sequence_has_its_decay(tmp_path: Path) ->
     assert fitted_at.fit is not None
     decay = answer["quantities"][0]["fits"][0]["parameters"]["decay"]
     assert decay["value"] == pytest.approx(fitted_at.fit.parameters["decay"].value)
+    (listed,) = client_of(tmp_path).get("/api/v1/runs?q=decay").json()["runs"]
+    assert listed["results"] == [{"name": "decay", "text": f"decay {fitted_at.fit.parameters['decay']}"}]
+    assert listed["scanned"] == "hold.duration 1 s to 40 s, 3 values"
 
 
 def test_a_map_has_the_quantity_at_each_site(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import { scanOfRun } from "./page_scan.js";
 const PAGE = 50;
 
 export async function showRuns(main, _, asked) {
-  const text = el("input", { type: "search", value: asked.get("q") ?? "", placeholder: "date, name, profile, outcome, comment, tag", "aria-label": "Search the runs" });
+  const text = el("input", { type: "search", value: asked.get("q") ?? "", placeholder: "date, name, profile, outcome, scan, result, comment, tag", "aria-label": "Search the runs" });
   const status = el("select", { "aria-label": "Status" }, ["", "running", "complete", "stopped", "failed", "damaged"].map((one) => el("option", { value: one, selected: one === (asked.get("status") ?? "") }, one || "any status")));
   const found = el("div"), note = el("span.note", { role: "status" });
   const chosen = new Set();
@@ -27,15 +27,20 @@ export async function showRuns(main, _, asked) {
     } catch (error) { patch(found, failure(error)); }
   }
   function listOf(runs) {
-    const heads = ["", "run", "started", "profile", { text: "shots", right: true }, "status", "measured", { text: "defect-free", right: true }, { text: "filling", right: true }, "comment"];
+    const heads = ["", "run", "started", "profile", { text: "shots", right: true }, "status", "scanned", "measured", { text: "defect-free", right: true }, { text: "filling", right: true }, "comment"];
     return table(heads, () => runs.map((run) => [
       el("input", { type: "checkbox", checked: chosen.has(run.id), "aria-label": `Choose ${run.id} to compare`, onchange: (event) => { event.target.checked ? chosen.add(run.id) : chosen.delete(run.id); compare.disabled = chosen.size !== 2; } }),
       runLink(run.id), localTime(run.started_utc), run.profile, run.n_shots === null ? "–" : `${run.n_done} of ${run.n_shots}`,
       [statusPill(run.status), run.simulated ? el("span.tag", {}, "simulated") : null, run.has_scan ? el("span.tag", {}, "scan") : null].filter(Boolean),
-      run.measured.filter((one) => !isOfTarget(one)).map((one) => `${one.title} ${meanText(one, one)}`).join(", ") || "–",
+      run.scanned || "–", resultsOf(run).join(", ") || "–",
       percent(run.defect_free), percentWithError(run.filling, run.filling_interval),
       [run.tags.map((tag) => el("span.tag", {}, tag)), " ", (run.comment || (run.status === "damaged" ? run.error : "")).slice(0, 120)],
     ].map((cell) => (Array.isArray(cell) ? el("span", {}, cell) : cell))), { label: "Runs" });
+  }
+  // Of a run in progress, means: its fits are on its page.
+  function resultsOf(run) {
+    const own = (listed) => listed.filter((one) => !isOfTarget(one));
+    return run.results.length ? own(run.results).map((one) => one.text) : own(run.measured).map((one) => `${one.title} ${meanText(one, one)}`);
   }
   function pages(n) {
     if (n <= PAGE) return null;
