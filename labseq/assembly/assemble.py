@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from labseq.assembly.measures import make_measures
 from labseq.assembly.options import DryRun, Options
 from labseq.assembly.plugin_choice import (
     ChosenPlugin,
@@ -23,9 +22,10 @@ from labseq.assembly.profile import ResolvedProfile, resolve_profile
 from labseq.config.addresses import PROFILE_ROLES, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_sequence
-from labseq.config.sequence import SequenceSpec, StepSpec, load_sequence
+from labseq.config.sequence import SequenceSpec, load_sequence
 from labseq.errors import ConfigError, LabseqError, PluginLoadError, ProblemCollector
 from labseq.model import TargetPattern
+from labseq.model.image_quantities import StepSummary, measured_by_default
 from labseq.model.policies import NO_POLICY, RunPolicy, StepPolicy
 from labseq.recording.folders import RESULT_PREFIX
 from labseq.recording.run_file import plain_regions
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from labseq.assembly.recorded import RecordedFiles
     from labseq.assembly.search import Search
     from labseq.config.scan import Scan
+    from labseq.plugins.host import PluginHost
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +204,7 @@ def _assembled(
         results = [*results, *readings_of(hardware, steps, is_whole=is_known)]
     # quantities may name regions, which a file with errors may have lost
     target = objects.get("target") if is_whole else None
-    policy = make_policy(document, sequence, steps, results, target, problems)
+    policy, policy_dumps = make_policy(document, sequence, steps, results, target, problems)
     measures = make_measures(document, sequence, steps, target, results, scan, hardware.host, problems)
     scanned: ScanPoints | None = None
     search: Search | None = None
@@ -227,7 +228,7 @@ def _assembled(
         "measure": measures,
         "target": objects["target_dump"],
         "planner": planner.dump(),
-        "shot": with_policies(document, sequence, step_dumps),
+        "shot": [step | own for step, own in zip(step_dumps, policy_dumps, strict=True)],
         "analysis": analyses,
         "profile": _profile_dump(hardware),
     }
@@ -359,48 +360,76 @@ def make_policy(
     results: Collection[str],
     target: TargetPattern | None,
     problems: ProblemCollector,
-) -> RunPolicy:
-    """The policies of a run and its steps."""
+) -> tuple[RunPolicy, list[dict[str, Any]]]:
+    """The policies of a run and its steps, and for the record of each step the ``policy`` that it has."""
     settings = sequence.policy
     otherwise = StepPolicy(on_failure=settings.on_failure, over_budget=settings.over_budget)
     policies = [NO_POLICY] * len(sequence.shot)
-    for number, spec in enumerate(sequence.shot):
-        with problems:
-            policies[number] = _step_policy(document, spec, otherwise)
+    dumps: list[dict[str, Any]] = [{} for _ in sequence.shot]
     is_whole = len(steps) == len(sequence.shot)
-    for number, (spec, policy) in enumerate(zip(sequence.shot, policies, strict=True)):
-        if is_whole and policy.retries and not steps[number][1].repeatable:
-            what = f"'{spec.kind}' cannot be tried again in the same shot: atoms may have moved"
-            hint = "write 'on_failure: repeat_shot'"
-            problems.add(document.error((*spec.policy_loc, "retries"), what, "0", hint, key=True))
+    for number, spec in enumerate(sequence.shot):
+        loc = spec.policy_loc
+        with problems:
+            own = document.validate(StepPolicy, loc, called=f"the policy of '{spec.kind}'")
+            policies[number] = replace(
+                own,
+                on_failure=own.on_failure or otherwise.on_failure,
+                over_budget=own.over_budget or otherwise.over_budget,
+            )
+            if document.root.at(loc) is not None:
+                keys = document.get(loc) or {}
+                written = [setting for setting in settings_of(StepPolicy) if setting.key in keys]
+                dumps[number] = {"policy": {one.key: getattr(own, one.name) for one in written}}
+            if is_whole and own.retries and not steps[number][1].repeatable:
+                what = f"'{spec.kind}' cannot be tried again in the same shot: atoms may have moved"
+                hint = "write 'on_failure: repeat_shot'"
+                raise document.error((*loc, "retries"), what, "0", hint, key=True)
     if settings.checks:
         from labseq.assembly.quantities import check_checks  # loads what a run without checks does not need
 
         check_checks(document, sequence, steps if is_whole else None, results, target, problems)
-    return RunPolicy(sequence.attempts, settings.when_exhausted, otherwise, tuple(policies))
+    return RunPolicy(sequence.attempts, settings.when_exhausted, otherwise, tuple(policies)), dumps
 
 
-def with_policies(
-    document: Document, sequence: SequenceSpec, dumps: Sequence[Mapping[str, Any]]
+def make_measures(
+    document: Document,
+    sequence: SequenceSpec,
+    steps: Sequence[tuple[str, Step]],
+    target: TargetPattern | None,
+    results: Collection[str],
+    scan: Scan | None,
+    host: PluginHost,
+    problems: ProblemCollector,
 ) -> list[dict[str, Any]]:
-    """The settings of the steps for the record, each with its policy."""
-    steps = [dict(dumped) for dumped in dumps]
-    for spec, dumped in zip(sequence.shot, steps, strict=True):
-        if document.root.at(spec.policy_loc) is not None:
-            policy = document.validate(StepPolicy, spec.policy_loc)
-            written = document.get(spec.policy_loc) or {}
-            settings = [setting for setting in settings_of(StepPolicy) if setting.key in written]
-            dumped["policy"] = {setting.key: getattr(policy, setting.name) for setting in settings}
-    return steps
+    """The quantities that a run measures, JSON-ready: as its sequence says, or chosen by its steps.
 
+    Args:
+        steps: The steps of a shot; fewer than in the sequence if some have errors.
+        target: The target; None if it has errors.
+        results: Names of the results of the analyses.
+        scan: The scan; None without one, or if it has errors.
+        host: The plugins, which may offer models to fit.
+        problems: Receives those of names, fits and parameters.
+    """
+    checked = steps if len(steps) == len(sequence.shot) else None
+    if sequence.measure is None:
+        summaries = [
+            StepSummary(name, step.takes_image, spec.kind == "load")
+            for spec, (name, step) in zip(sequence.shot, checked or (), strict=False)
+        ]
+        has_target = target is not None and not target.is_none
+        return [{"value": name} for name in measured_by_default(summaries, has_target=has_target)]
+    from labseq.assembly.quantities import check_quantity  # loads what other runs do not need
 
-def _step_policy(document: Document, spec: StepSpec, otherwise: StepPolicy) -> StepPolicy:
-    policy = document.validate(StepPolicy, spec.policy_loc, called=f"the policy of '{spec.kind}'")
-    return replace(
-        policy,
-        on_failure=policy.on_failure or otherwise.on_failure,
-        over_budget=policy.over_budget or otherwise.over_budget,
-    )
+    for number, measure in enumerate(sequence.measure):
+        with problems:
+            place = ("measure", number, "value")
+            check_quantity(document, place, measure.value, "to measure", checked, results, target)
+            if measure.fit is not None:
+                from labseq.assembly.fits import check_fit  # most runs fit nothing
+
+                check_fit(document, sequence, scan, number, target, host)
+    return [measure.model_dump(mode="json", exclude_defaults=True) for measure in sequence.measure]
 
 
 def _grid_note(hardware: ResolvedProfile) -> str:
