@@ -291,19 +291,22 @@ class AdaptiveScan(Scan):
         return document
 
 
-def at_first_point(
+def load_scan(
     document: Document,
     overrides: Sequence[Override],
     profile_set: Sequence[Override],
     problems: ProblemCollector,
 ) -> tuple[Document, Scan | None]:
-    """A copy with the values of the first point and with ``shots`` from the scan; and the scan.
+    """Read the scan of a sequence, and put the values of its first point into a copy of the sequence.
 
     Args:
         document: A sequence with a scan.
         overrides: Its overrides.
         profile_set: Those of the profile, with their "profile.".
-        problems: Receives those of the scan; without a valid scan the copy has none.
+        problems: Receives those of the scan.
+
+    Returns:
+        The copy, also with ``shots`` from the scan; and the scan. If it is invalid: a copy without it, None.
     """
     try:
         scan = read_scan(document, [*overrides, *profile_set])

@@ -338,9 +338,9 @@ def load_sequence(
         if document.data.get("scan") is None:
             _refuse_without_scan(document, collector)
         else:
-            from labseq.config.scan import at_first_point  # a sequence without a scan does not need it
+            from labseq.config.scan import load_scan  # a sequence without a scan does not need it
 
-            document, scan = at_first_point(document, overrides, profile_set, collector)
+            document, scan = load_scan(document, overrides, profile_set, collector)
         return *load_checked(document, SequenceSpec, "a sequence", _FALLBACKS, collector), scan
 
 
