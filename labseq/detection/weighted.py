@@ -163,9 +163,9 @@ class WeightedDetector(ComparingDetector):
 
     def _ready(self) -> Weights:
         if self._weights is None:
-            from labseq.detection import kernels as weigh_sites
+            from labseq.detection import kernels  # compiled only where this detector is used
 
-            self._kernels = weigh_sites
+            self._kernels = kernels
             self._weights = site_weights(self._settings, self._known, self._corners)
         return self._weights
 
