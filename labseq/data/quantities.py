@@ -147,12 +147,13 @@ def quantity_problem(
             return None
         near = closest(kind, [*OF_IMAGES, *columns])
         hint = f"did you mean '{near}'?" if near else ""
-        forms = ("survival:IMAGE,IMAGE", *(f"{kind}[:IMAGE]" for kind in OF_IMAGES if kind != "survival"))
+        forms = (f"{kind}[:{quantity.images}]" for kind, quantity in OF_IMAGES.items())
         names = ", ".join([*forms, *columns, *(f"{prefix}<name>" for prefix in open_prefixes)])
         return f"there is no quantity '{clean(name)}'", f"one of {names}", hint
-    if named and len(named) != OF_IMAGES[kind].n_images:
-        expected = "two images: survival:IMAGE,IMAGE" if kind == "survival" else f"one image: {kind}:IMAGE"
-        return f"'{clean(name)}' names {len(named)} image{'s' * (len(named) != 1)}", expected, ""
+    of_images = OF_IMAGES[kind]
+    if named and len(named) != of_images.n_images:
+        what = f"'{clean(name)}' names {len(named)} image{'s' * (len(named) != 1)}"
+        return what, f"{kind}:{of_images.images}", ""
     for image in named:
         is_known = image in images or image.isdecimal() or any(image.startswith(f"{i}_") for i in images)
         if images and not is_known:
@@ -160,9 +161,9 @@ def quantity_problem(
             problem = f"there is no image '{clean(image)}' for '{clean(name)}'"
             return problem, f"one of {', '.join(images)}", f"did you mean '{near}'?" if near else ""
     places = [images.index(image) for image in named if image in images]
-    if kind == "survival" and len(places) == 2 and places[0] >= places[1]:
+    if len(places) == 2 and places[0] >= places[1]:
         return f"'{clean(name)}' goes from an image to one that is not later", "the earlier image first", ""
-    if kind in WITH_TARGET and target is not None and target.is_none:
+    if of_images.needs_target and target is not None and target.is_none:
         return f"there is no '{clean(name)}': the run has no target", "loading or survival, or a target", ""
     return None if target is None else _sites_problem(name, sites, target)
 

@@ -179,6 +179,7 @@ class ImageQuantity:
         about: Its description.
         n_images: Number of images that its name may give.
         is_rate: Whether it counts events in trials: shots are then added up.
+        needs_target: Whether it has no value in a run without a target.
         at_sites: Its value at each site: takes a shot, the target and the names of the images.
         sum_up: The value of a shot from the numbers of sites where it happened and where it could.
     """
@@ -186,39 +187,49 @@ class ImageQuantity:
     about: str
     n_images: int
     is_rate: bool
+    needs_target: bool
     at_sites: Callable[..., AtSites]
     sum_up: Callable[[int, int], Events]
+
+    @property
+    def images(self) -> str:
+        """The images that its name may give, for messages."""
+        return ",".join(["IMAGE"] * self.n_images)
 
 
 OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
     "survival": ImageQuantity(
         "atoms of an image that a later one still shows, at the sites to which they were moved; "
         "by default from the first image to the last",
-        2,
-        True,
-        _survival,
-        lambda n, n_tried: (n, n_tried),
+        n_images=2,
+        is_rate=True,
+        needs_target=False,
+        at_sites=_survival,
+        sum_up=lambda n, n_tried: (n, n_tried),
     ),
     "filling": ImageQuantity(
         "share of the target's sites with an atom; last image",
-        1,
-        False,
-        _filling,
-        lambda n, n_tried: (1 - (n_tried - n) / n_tried, 1),
+        n_images=1,
+        is_rate=False,
+        needs_target=True,
+        at_sites=_filling,
+        sum_up=lambda n, n_tried: (1 - (n_tried - n) / n_tried, 1),
     ),
     "defect_free": ImageQuantity(
         "whether the target is met; last image",
-        1,
-        True,
-        _defect_free,
-        lambda n, n_tried: (float(n == n_tried), 1),
+        n_images=1,
+        is_rate=True,
+        needs_target=True,
+        at_sites=_defect_free,
+        sum_up=lambda n, n_tried: (float(n == n_tried), 1),
     ),
     "loading": ImageQuantity(
         "share of all sites with an atom; first image",
-        1,
-        False,
-        _loading,
-        lambda n, n_tried: (n / n_tried, 1),
+        n_images=1,
+        is_rate=False,
+        needs_target=False,
+        at_sites=_loading,
+        sum_up=lambda n, n_tried: (n / n_tried, 1),
     ),
 }
 """The kinds, by the beginning of their names."""

@@ -69,13 +69,16 @@ def test_every_recorded_or_analysed_number_is_a_quantity(lifetime: labseq.Run) -
 @pytest.mark.parametrize(
     ("name", "printed"),
     [
-        ("survivl:before,after", "no quantity 'survivl:before,after'; expected one of survival:IMAGE,IMAGE"),
+        (
+            "survivl:before,after",
+            "no quantity 'survivl:before,after'; expected one of survival[:IMAGE,IMAGE]",
+        ),
         ("survivl:before,after", "did you mean 'survival'?"),
         (
             "survival:befor,after",
             "no image 'befor' for 'survival:befor,after'; expected one of before, after; did",
         ),
-        ("survival:before", "names 1 image; expected two images"),
+        ("survival:before", "names 1 image; expected survival:IMAGE,IMAGE"),
         ("filing_fraction", "did you mean 'filling_fraction'?"),
     ],
 )

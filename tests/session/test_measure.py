@@ -80,7 +80,7 @@ def test_some_sites_are_measured(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("measure: [survivl]", "5:11: there is no quantity 'survivl' to measure; expected one of survival:"),
+        ("measure: [survivl]", "5:11: there is no quantity 'survivl' to measure; expected one of survival[:"),
         ("measure: [{value: loading, fot: x}]", "5:28: 'fot' is not a setting"),
         ("measure: ['survival:before,aftr']", "did you mean 'after'?"),
         ("measure: [loading@target]", "5:11: there are no sites 'target' (the run has no target) to measure"),
