@@ -119,16 +119,19 @@ class RunWriter:
 
         Args:
             run: Its current record, for the files of the next shots; only ``resumed`` is written to run.json,
-                and what follows from the number of shots if that has grown.
+                and what follows from the number of shots if that has grown. All other settings there are
+                those of the first shots; changes that were accepted are in ``resumed``.
             n_written: Number of shots written before that count.
             stop: The request to stop the run.
 
         Raises:
             RecordingError: The folder cannot be written to, the disk is full, or run.json is damaged.
         """
-        before = {**read_run(run_dir), "resumed": run.resumed}
+        before: dict[str, Any] = {**read_run(run_dir), "resumed": run.resumed}
         if run.n_shots != before["n_shots"]:
-            before |= {name: getattr(run, name) for name in ("n_shots", "scan", "overrides", "resolved")}
+            before |= {"n_shots": run.n_shots, "scan": run.scan}
+            for name in ("overrides", "resolved"):
+                before[name] = {**before[name], "shots": getattr(run, name)["shots"]}
         with explained(run_dir):
             (run_dir / folders.STOP_FILE).unlink(missing_ok=True)
             # all files, as one may have been written without its line in the index

@@ -156,7 +156,7 @@ class ResumableRun:
             raise ConfigError([*problems, Problem(what, str(folder), hint=hint)])
 
     def reopen(self, record: RunRecord, code: RunCode, first_shot: int | None, stop: StopFlag) -> RunWriter:
-        """Open its folder for writing, and keep the sources of the plugins there if they have changed.
+        """Open its folder for writing, and keep the sources of the plugins if changed ones take shots.
 
         Args:
             record: The current record of the run.
@@ -177,7 +177,7 @@ class ResumableRun:
         then = str(self.run.record["t_start_utc"])
         record = replace(record, t_start_utc=then, resumed=resumed)
         writer = RunWriter.reopen(self.run.path, record, n_written=len(self.rows), stop=stop)
-        if code_changes(self.run, record):
+        if first_shot is not None and code_changes(self.run, record):
             path = self.run.path / SOURCES_FILE
             write_file(path.with_stem(f"{path.stem}_{len(resumed)}"), code.archive)
         return writer

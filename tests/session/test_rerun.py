@@ -13,7 +13,7 @@ import labseq
 from labseq.errors import ConfigError
 from labseq.testing.fakes import RecordingObserver
 
-from .small_runs import write
+from .small_runs import changed, write
 
 
 def test_a_run_begins_with_its_note(tmp_path: Path) -> None:
@@ -37,11 +37,22 @@ def test_a_complete_run_gets_more_shots(tmp_path: Path) -> None:
     with labseq.Session.resume(run.path, shots=8) as session:
         more = session.run()
     assert (more.status, more.n_shots, len(more.shots)) == ("complete", 8, 8)
-    assert more.scan == whole.scan
+    for name in ("scan", "overrides", "resolved"):
+        assert more.record[name] == whole.record[name]
     for shot, other in zip(more.shots, whole.shots, strict=True):
         assert np.array_equal(shot.occupancies, other.occupancies)
     with pytest.raises(ConfigError, match="no shot is missing; --shots N adds more"):
         labseq.Session.resume(run.path)
+
+
+def test_more_shots_leave_the_settings_of_the_first_on_record(tmp_path: Path) -> None:
+    run = labseq.Session.open(write(tmp_path), shots=1, output=tmp_path).run()
+    changed(run.path, lambda record: record["resolved"]["planner"].update(degree_of_parallelism=3))
+    with labseq.Session.resume(run.path, shots=2, accept_changes=True) as session:
+        record = session.run().record
+    assert (record["n_shots"], record["resolved"]["shots"]) == (2, 2)
+    assert record["resolved"]["planner"]["degree_of_parallelism"] == 3
+    assert [change["what"] for change in record["resumed"][0]["changes"]] == ["planner.degree_of_parallelism"]
 
 
 def test_a_run_is_taken_again(tmp_path: Path) -> None:

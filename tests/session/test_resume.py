@@ -137,8 +137,10 @@ def test_a_run_that_died_after_its_last_shot_is_complete(tmp_path: Path) -> None
     assert labseq.open_run(run_dir).status == "complete"
     state_of_another(run_dir, started="another")
     assert labseq.open_run(run_dir).status == "failed"
-    run = resumed(run_dir)
+    changed(run_dir, lambda record: record["plugins"][0].update(sha256="0" * 64))
+    run = resumed(run_dir, accept_changes=True)
     assert (run.status, len(run.shots), run.record["resumed"]) == ("complete", 6, [])
+    assert [path.name for path in run_dir.glob("sources*")] == ["sources.zip"]  # today's took no shot
 
 
 def test_options_a_dry_run_and_relative_paths_are_kept(

@@ -15,6 +15,7 @@ import pytest
 import labseq
 from labseq.errors import ConfigError
 from labseq.session.provenance import code_of
+from labseq.session.sources import repositories
 
 from .small_runs import PROFILE, interrupted, resumed
 
@@ -119,6 +120,19 @@ def test_a_run_names_and_keeps_all_code_that_made_it(lab: Path, monkeypatch: pyt
     with zipfile.ZipFile(io.BytesIO(code.archive)) as archive:
         assert archive.read("blinking/core.py").decode() == CORE
         assert archive.read("diary/diary.py").decode() == OBSERVER
+
+
+def test_a_difference_can_be_applied(lab: Path) -> None:
+    file = lab / "my/blinking/core.py"
+    file.write_text(CORE.rstrip() + "\n\n\n", "utf-8")
+    git = ["git", "-C", str(lab), "-c", "user.name=x", "-c", "user.email=x"]
+    subprocess.run([*git, "commit", "-qam", "y"], check=True)
+    changed = file.read_text("utf-8").replace("float(", "2 * float(")
+    file.write_text(changed, "utf-8")
+    diff = repositories([file])[file].diff
+    subprocess.run([*git, "checkout", "-q", "."], check=True)
+    subprocess.run([*git, "apply"], input=diff.encode(), check=True)
+    assert file.read_text("utf-8") == changed
 
 
 def test_an_edited_step_is_in_the_record_and_resume_shows_the_line(lab: Path) -> None:
