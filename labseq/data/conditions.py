@@ -16,7 +16,7 @@ from labseq.data.shot import Shot
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, closest
 from labseq.model.image_quantities import OF_IMAGES, parse_name
-from labseq.units import parse_any
+from labseq.units import dimension_of, parse_any
 
 _COMPARISONS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     # a computed value and a typed one differ in their last digits
@@ -56,19 +56,25 @@ class Condition:
             raise ConfigError(Problem(message, "--where", expected="for example 'filling:before == 1'"))
         return cls(*match.groups())
 
-    def of_numbers(self) -> Callable[[float], bool]:
-        """The condition on a number, SI.
+    def of_numbers(self, unit: str = "") -> Callable[[float], bool]:
+        """The condition on a number, SI, which nan never meets.
+
+        Args:
+            unit: SI unit of the number; "" for a fraction, or if it is unknown.
 
         Raises:
-            ConfigError: The limit is not a number.
+            ConfigError: The limit is not a number, or has another unit.
         """
         try:
             is_plain = re.fullmatch(r"[-+.\deE]+", self.limit)
-            limit = float(self.limit) if is_plain else parse_any(self.limit)[0]
+            limit, dimension = (float(self.limit), "") if is_plain else parse_any(self.limit)
         except ValueError as error:
             expected = "a number, or one with a unit"
             raise ConfigError(Problem(str(error), "--where", expected=expected)) from error
-        return lambda value: _COMPARISONS[self.comparison](value, limit)
+        if unit and dimension not in ("", dimension_of(unit)):
+            what = f"'{clean(self.limit)}' does not have the unit of '{clean(self.name)}'"
+            raise ConfigError(Problem(what, "--where", expected=f"a number in {unit}, or one with its unit"))
+        return lambda value: not math.isnan(value) and _COMPARISONS[self.comparison](value, limit)
 
     def of_texts(self) -> Callable[[str], bool]:
         """The condition on a text.
@@ -90,19 +96,21 @@ def select_shots(run: Run, conditions: Iterable[str]) -> tuple[Shot, ...]:
     """
     shots = tuple(run.shots)
     for condition in map(Condition.of, conditions):
-        value_of, is_text = _values_of_shots(run, condition.name)
-        meets: Callable[[Any], bool] = condition.of_texts() if is_text else condition.of_numbers()
-        shots = tuple(shot for shot in shots if meets(value_of(shot)))
+        meets = _meets(run, condition)
+        shots = tuple(shot for shot in shots if meets(shot))
     return shots
 
 
-def _values_of_shots(run: Run, name: str) -> tuple[Callable[[Shot], Any], bool]:
-    """The values of a column of the export, or of a quantity, and whether they are text."""
-    columns = {column.name: column for column in columns_of(run)}
+def _meets(run: Run, condition: Condition) -> Callable[[Shot], bool]:
+    """Whether a shot meets a condition on a column of the export, or on a quantity."""
+    name, columns = condition.name, {column.name: column for column in columns_of(run)}
     if name in columns:
-        values = columns[name].values
+        values, unit = columns[name].values, columns[name].units
         of_shot = dict(zip((shot.index for shot in run.shots), values.tolist(), strict=True))
-        return lambda shot: of_shot[shot.index], values.dtype == object
+        of_value: Callable[[Any], bool] = (
+            condition.of_texts() if values.dtype == object else condition.of_numbers(unit)
+        )
+        return lambda shot: of_value(of_shot[shot.index])
     if parse_name(name).kind not in OF_IMAGES:
         near = closest(name, [*columns, *OF_IMAGES])
         raise ConfigError(
@@ -113,4 +121,5 @@ def _values_of_shots(run: Run, name: str) -> tuple[Callable[[Shot], Any], bool]:
                 hint=f"did you mean '{near}'?" if near else "",
             )
         )
-    return find_quantity(run, name).of_shot, False
+    quantity, of_number = find_quantity(run, name), condition.of_numbers()
+    return lambda shot: of_number(quantity.of_shot(shot))

@@ -107,6 +107,9 @@ def test_shots_are_selected_by_any_quantity(lifetime: labseq.Run) -> None:
         lifetime.select("loading:before > 2")
     with pytest.raises(ConfigError, match="this is not a condition: 'before full'"):
         select_shots(lifetime, ["before full"])
+    with pytest.raises(ConfigError, match=r"'30 Hz' does not have the unit of 'shot\.hold\.dur"):
+        select_shots(lifetime, ["shot.hold.duration > 30 Hz"])
+    assert not select_shots(lifetime, ["loading:9 != 1"])  # no shot has so many images
 
 
 def test_a_lifetime_scan_gives_the_lifetime_of_the_profile(lifetime: labseq.Run) -> None:
