@@ -15,7 +15,7 @@ from labseq.errors import ConfigError, Loc, PluginLoadError, UnknownPluginError,
 from labseq.messages import clean, did_you_mean
 from labseq.model import TargetPattern
 from labseq.plugins.host import PluginHost
-from labseq.units import si_unit_of
+from labseq.units import dimension_of, si_unit_of
 
 if TYPE_CHECKING:
     from labseq.data.fits import Model
@@ -85,10 +85,11 @@ def find_model(document: Document, place: Loc, name: str, host: PluginHost) -> M
 
 
 def _scanned_unit(document: Document, place: Loc, scan: Scan | None) -> str:
-    """The SI unit of the value to fit along, the first of the scan."""
-    if scan is None or not scan.groups:  # an option may have replaced every address
+    """The SI unit of the value to fit along, the first of the scan that has several values."""
+    if scan is None or not scan.axes:  # an option may have replaced every address
         return ""
-    axis = scan.groups[0][0]
+    several = (axis for axis in scan.axes if len({str(value.plain()) for value in axis.values}) > 1)
+    axis = next(several, scan.axes[0])
     try:
         return si_unit_of(f"1 {numbers_of(axis.values)[0].unit}")
     except ConfigError:
@@ -125,8 +126,9 @@ def _check_stop(
         try:
             read_limit(written, unit)
         except ValueError as error:
-            example = f"0.1 {unit}" if unit.replace("%", "") else "0.01"
-            expected = f"the error to reach: 2 % of the value, or {example}"
+            # a sequence cannot have units such as %/s
+            limit = f"0.1 {unit}" if dimension_of(unit) else f"a number in {unit.replace('%', '1')}"
+            expected = f"the error to reach: 2 % of the value, or {'0.01' if unit in ('', '%') else limit}"
             raise document.error(loc, str(error), expected) from None
     if sequence.order != "shuffled":
         what = "the run cannot end early: it takes all shots of a point before it goes to the next"

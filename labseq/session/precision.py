@@ -25,6 +25,7 @@ from labseq.data.scanned import FitRequest, fits_along, on_axes, request_of
 from labseq.data.series import Series
 from labseq.errors import ConfigError, PluginLoadError, RecordingError
 from labseq.guard import Guard, StopFlag
+from labseq.messages import format_error
 from labseq.recording.index import IndexRow
 
 MAX_FIT_S: Final = 10.0
@@ -74,6 +75,7 @@ class Precision:
         ]
         for row in rows:
             self._add(row)
+            self._is_due()  # so that a resumed run makes the fits that it would have made anyway
 
     def after(self, row: IndexRow) -> str:
         """Judge the fits after a shot that was taken.
@@ -85,23 +87,29 @@ class Precision:
             StopRequested: The run was asked to stop during the fit.
         """
         self._add(row)
-        if self._n_shots < self._next or self._n_shots % len(self._points):
+        if not self._is_due():
             return ""
-        self._next = GROWTH * self._n_shots
         results: list[str] = []
         for aim in self._aims:
             call = self._guard.run("fit", MAX_FIT_S, partial(self._results, aim))
             if call is None:
                 self._give_up(f"the fit {aim.request.model} has not ended after {MAX_FIT_S:.0f} s")
                 return ""
-            if call.error is not None:
-                if isinstance(call.error.__cause__, PluginLoadError):
-                    self._give_up(str(call.error.__cause__))
-                elif not isinstance(call.error, ConfigError | RecordingError):
-                    raise call.error
+            if (error := call.error) is not None:
+                if isinstance(error.__cause__, PluginLoadError):
+                    self._give_up(str(error.__cause__))
+                elif not isinstance(error, ConfigError | RecordingError):  # the shots are good
+                    self._give_up(format_error(error))
                 return ""  # more shots may give a fit
             results += call.result
         return f"stop_when reached: {', '.join(results)}" if all(results) else ""
+
+    def _is_due(self) -> bool:
+        """Whether the fits are made now, after a whole round of the points; they are then made later again."""
+        is_due = self._n_shots >= self._next and not self._n_shots % len(self._points)
+        if is_due:
+            self._next = GROWTH * self._n_shots
+        return is_due
 
     def _give_up(self, why: str) -> None:
         self._next = math.inf

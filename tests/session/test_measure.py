@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import pytest
 import labseq
 from labseq.data.follower import Follower
 from labseq.data.quantities import measured_by
-from labseq.errors import ConfigError
+from labseq.errors import ConfigError, StopRequested
 
+from .small_runs import Interrupting, resumed
 from .whole_runs import SMALL_FRAMES
 
 HEAD = "labseq: 1\nname: m\nseed: 5\nshots: 2\n"
@@ -187,6 +189,14 @@ def test_an_error_to_reach_is_one_of_a_fitted_parameter(tmp_path: Path, measure:
     assert expected in message(tmp_path, text).replace(";  ", "; ")
 
 
+def test_an_error_has_the_unit_of_what_is_fitted_along(tmp_path: Path) -> None:
+    one_value = SCANNED.replace("scan: {", "scan: {profile.simulation.loading: [60 %], ")
+    slope = "measure: [{value: survival, fit: linear, stop_when: {slope: 1 %/s}}]\n"
+    assert "or a number in 1/s" in message(tmp_path, one_value + slope + SURVIVAL)
+    decay = "measure: [{value: survival, fit: exponential, stop_when: {decay: 1 s}}]\n"
+    opened(tmp_path, one_value + decay + SURVIVAL)
+
+
 def test_a_run_that_takes_point_after_point_cannot_end_early(tmp_path: Path) -> None:
     text = SCANNED.replace("order: shuffled\n", "")
     text += "measure: [{value: survival, fit: exponential, stop_when: {decay: 2 %}}]\n" + SURVIVAL
@@ -243,6 +253,25 @@ def test_a_run_ends_when_its_result_is_known(
     assert value.error > 0.05 * value.value or before.reduced_chi_square > 4
     with pytest.raises(ConfigError, match="the run cannot be resumed: it is complete: stop_when reached"):
         labseq.Session.resume(run.path)
+
+
+def test_a_resumed_run_ends_at_the_same_shot(tmp_path: Path) -> None:
+    measure = "measure: [{value: survival, fit: exponential, stop_when: {decay: 1.3 %}}]\n"
+    runs: list[labseq.Run] = []
+    for n_before in (0, 64):
+        observer = Interrupting("shot_finished", n_before)
+        path = tmp_path / "m.yaml"
+        path.write_text(SCANNED + measure + SURVIVAL, "utf-8")
+        with labseq.Session.open(
+            path, seed=1, output=tmp_path, overrides=SMALL_FRAMES, observer=observer
+        ) as session:
+            observer.session = session
+            with suppress(StopRequested):
+                session.run()
+        assert session.run_dir is not None
+        runs.append(resumed(session.run_dir) if n_before else labseq.open_run(session.run_dir))
+    assert (len(runs[0].shots), runs[0].ended_early) == (len(runs[1].shots), runs[1].ended_early)
+    assert 66 < len(runs[0].shots) < 120
 
 
 @pytest.mark.parametrize(("fit", "warning"), [("linear", ""), ("broken", "raised TypeError")])
