@@ -75,20 +75,31 @@ def code_changes(run: Run, today: RunRecord) -> list[Change]:
         if before := archived_sources(run.path, name):
             after = read_sources(Path(plugin["path"]))
             for file in sorted(file for file in {*before, *after} if before.get(file) != after.get(file)):
-                changes.append(_first_difference(f"plugin {name}: {file}", before.get(file), after.get(file)))
+                changes.append(first_difference(f"plugin {name}: {file}", before.get(file), after.get(file)))
         else:  # labseq's own sources are not kept
             changes.append(Change(f"the code of {name}", f"SHA-256 {was[:12]}", now[:12]))
     return changes
 
 
-def _first_difference(file: str, before: bytes | None, after: bytes | None) -> Change:
+def first_difference(file: str, before: bytes | None, after: bytes | None) -> Change:
     """The first line of a file that has changed."""
     if before is None or after is None:
         return Change(file, "missing" if before is None else "there", "missing" if after is None else "there")
-    lines = [data.decode("utf-8", "replace").splitlines() for data in (before, after)]
+    lines = [data.decode("utf-8", "surrogateescape").splitlines(keepends=True) for data in (before, after)]
     pairs = enumerate(zip_longest(*lines, fillvalue=""), 1)
-    number, (was, now) = next((pair for pair in pairs if pair[1][0] != pair[1][1]), (0, ("", "")))
-    return Change(f"{file}, line {number}", _cut(repr(was.strip())), _cut(repr(now.strip())))
+    number, pair = next((number, pair) for number, pair in pairs if pair[0] != pair[1])
+    stripped = tuple(line.strip() for line in pair)
+    # lines may differ in their indentation or their ends alone
+    was, now = _around_difference(*(stripped if stripped[0] != stripped[1] else pair))
+    return Change(f"{file}, line {number}", repr(was), repr(now))
+
+
+def _around_difference(was: str, now: str) -> tuple[str, str]:
+    """Two lines, of long ones the part in which they begin to differ."""
+    different = (i for i, (before, after) in enumerate(zip(was, now, strict=False)) if before != after)
+    n_same = next(different, min(len(was), len(now)))
+    start = max(0, n_same - _MAX_TEXT // 2) if max(len(was), len(now)) > _MAX_TEXT else 0
+    return _cut(was[start:]), _cut(now[start:])
 
 
 def differences(then: Mapping[str, Any], today: RunRecord, name: str) -> list[Change]:

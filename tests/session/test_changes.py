@@ -11,7 +11,7 @@ import pytest
 
 import labseq
 from labseq.errors import ConfigError
-from labseq.session.changes import changes_between, record_today
+from labseq.session.changes import changes_between, first_difference, record_today
 from labseq.testing.fakes import RecordingObserver
 
 from .small_runs import SEQUENCE, changed, resumed, stopped, stopped_home
@@ -83,6 +83,19 @@ def test_uncommitted_code_is_compared(stopped: Path) -> None:
     ):
         (change,) = changes(then_code, now_code)
         assert re.search(words, change)
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "change"),
+    [
+        (b"if x:\n    y = 1\n", b"if x:\ny = 1\n", "line 2 was '    y = 1\\n', is 'y = 1\\n'"),
+        (b"a\nb\n", b"a\r\nb\r\n", "line 1 was 'a\\n', is 'a\\r\\n'"),
+        (b"-" * 70 + b"1", b"-" * 70 + b"2", f"was '{'-' * 30}1', is '{'-' * 30}2'"),
+        (b"# \xb5", b"# \xe4", r"line 1 was '# \udcb5', is '# \udce4'"),
+    ],
+)
+def test_the_first_line_that_differs_shows_the_difference(was: bytes, now: bytes, change: str) -> None:
+    assert str(first_difference("core.py", was, now)).endswith(change)
 
 
 def test_the_runs_own_texts_count(stopped: Path, tmp_path: Path) -> None:
