@@ -20,7 +20,7 @@ from labseq.console.text import plural, quoted
 from labseq.data import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.files import packaged_profiles_dir, packaged_sequences_dir
-from labseq.messages import install_hint, listing, visible
+from labseq.messages import install_hint, visible
 from labseq.queue.queue import Queue
 from labseq.recording import data_root
 from labseq.recording.folders import NOTIFY_FILE
@@ -117,7 +117,7 @@ def try_notice(text: str) -> None:
         raise ConfigError(Problem("there is no such file", visible(str(path)), expected=expected))
     if failures := send(settings.task("test", "", text)):
         raise ConfigError([Problem(failure, visible(str(path))) for failure in failures])
-    say(f"sent to {listing([*settings.command[:1], *([settings.webhook] if settings.webhook else [])])}")
+    say(f"sent to {' and '.join(filter(None, [*settings.command[:1], settings.webhook]))}")
 
 
 def _print_result(

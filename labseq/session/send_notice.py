@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import subprocess
 import sys
@@ -32,7 +33,7 @@ def send(task: Mapping[str, Any]) -> list[str]:
     for way in ways:
         try:
             way()
-        except (OSError, ValueError, subprocess.SubprocessError) as error:
+        except (OSError, ValueError, http.client.HTTPException, subprocess.SubprocessError) as error:
             failures.append(f"{type(error).__name__}: {error}")
     return failures
 

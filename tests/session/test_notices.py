@@ -57,6 +57,8 @@ def test_every_way_is_tried_and_each_failure_is_named(
     Receiver.status = 500
     failures = send({"command": ["no-such-program"], "webhook": address, "notice": notice})
     assert [failure.partition(":")[0] for failure in failures] == ["FileNotFoundError", "HTTPError"]
+    misspelt = send({"command": [], "webhook": "http://localhost:80x/", "notice": notice})
+    assert misspelt == ["InvalidURL: nonnumeric port: '80x'"]
 
 
 class Sent(list[dict[str, str]]):
