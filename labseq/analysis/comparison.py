@@ -34,7 +34,7 @@ from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean
 from labseq.model.estimate import Estimate, Estimated
 from labseq.pictures.figures import check_place
-from labseq.units import factor_of
+from labseq.units import factor_of, si_unit_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -284,7 +284,16 @@ class Trend:
         return aligned(filled_columns(rows))
 
     def picture(self) -> RunPicture:
-        """The number against the time, with a line where a calibration has changed."""
+        """The number against the time, with a line where a calibration has changed.
+
+        Raises:
+            ConfigError: It has several units, such as the centres of scans of a time and of a frequency.
+        """
+        units = list(dict.fromkeys(point.value.text_unit for point in self.points))
+        if len(units) > 1:
+            what = f"'{clean(self.name)}' has several units: {' and '.join(unit or 'none' for unit in units)}"
+            expected = "runs in which it has one, chosen for example by --sequence"
+            raise ConfigError(Problem(what, expected=expected))
         n_runs = plural(len(self.points), "run")
         return RunPicture(f"{clean(self.name)} of {n_runs}", "", ((self._draw,),))
 
@@ -314,7 +323,7 @@ def _number(entry: RunEntry, name: str) -> Parameter | None:
         if result.name == name and not result.at:
             return result.value
     if isinstance(setting := entry.settings.get(name), int | float):
-        return Parameter(float(setting), math.nan, "")
+        return Parameter(float(setting), math.nan, si_unit_of(entry.changes[name]))
     with suppress(LabseqError):
         run = entry.open()
         quantity = find_quantity(run, name)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from labseq.data import Run
+from labseq.files import write_file
 
 DAYS = ("2026-11-20", "2026-11-21", "2026-11-28")
 
@@ -59,12 +60,24 @@ def test_a_number_over_the_days_with_its_calibrations(data: Path, call: Any) -> 
     points = json.loads(out)["points"]
     assert [point["new_calibrations"] for point in points] == [[], [], []]
     assert points[0]["value"] == pytest.approx(0.75, abs=0.02)
-    record = json.loads((data / "data" / DAYS[2] / "0007_lifetime" / "run.json").read_text("utf-8"))
-    (data / "data" / DAYS[2] / "0007_lifetime" / "run.json").write_text(
-        json.dumps({**record, "calibrations": {"sites": "new"}}), "utf-8"
-    )
+    file = data / "data" / DAYS[2] / "0007_lifetime" / "run.json"
+    record = json.loads(file.read_text("utf-8"))
+    write_file(file, json.dumps({**record, "calibrations": {"sites": "new"}}).encode())
     out = call("trend", "decay")[1]
     assert [line.split()[-1] for line in out.splitlines()] == ["calibrations", "s", "s", "sites"]
     assert "sites" not in picture.read_text("utf-8")
     code, _, err = call("trend", "tau")
     assert (code, err) == (2, "error: no run has a value 'tau'; expected one of decay\n")
+
+
+def test_a_setting_over_the_days_has_its_unit_and_several_are_not_drawn(data: Path, call: Any) -> None:
+    for day, value, text in ((DAYS[0], 5e-3, "5 ms"), (DAYS[1], 7e-3, "7 ms"), (DAYS[2], 2e6, "2 MHz")):
+        file = data / "data" / day / "0007_lifetime" / "run.json"
+        record = json.loads(file.read_text("utf-8"))
+        record["overrides"]["variables.x"] = {"value": value, "unit": "", "written": text}
+        file.write_text(json.dumps(record), "utf-8")
+    out = call("trend", "variables.x")[1]
+    assert [line.split()[3:5] for line in out.splitlines()[1:]] == [["5", "ms"], ["7", "ms"], ["2", "MHz"]]
+    code, _, err = call("trend", "variables.x", "-o", str(data / "x.png"))
+    assert (code, err.split(";")[0]) == (2, "error: 'variables.x' has several units: s and Hz")
+    assert call("trend", "variables.x", "--until", DAYS[1], "-o", str(data / "x.png"))[0] == 0
