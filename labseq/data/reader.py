@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from labseq.data.shot import CachingLoader, Shot
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import read_lines
-from labseq.messages import clean
+from labseq.messages import clean, visible
 from labseq.model import TargetPattern
 from labseq.model.records import RunStatus
 from labseq.plain import to_plain
@@ -101,6 +101,8 @@ class Run:
     def __repr__(self) -> str:
         return f"<Run {self.path}: {len(self.shots)} of {self.n_shots} shots, {self.status}>"
 
+    # what a method needs is imported in it: a run that is being taken is opened, too, and needs none of it
+
     @property
     def name(self) -> str:
         """Name of the sequence."""
@@ -152,7 +154,7 @@ class Run:
     @property
     def note(self) -> str:
         """The note about the run, of the page or ``labseq note``; read from its file each time."""
-        from labseq.recording.notes import read_notes  # a run in progress does not need it
+        from labseq.recording.notes import read_notes
 
         return read_notes(self.path).comment
 
@@ -188,7 +190,7 @@ class Run:
     @property
     def defect_free(self) -> float:
         """Fraction of the shots that met the target, of those that were judged; nan without any."""
-        from labseq.model.estimate import mean  # a run itself does not need it
+        from labseq.model.estimate import mean
 
         return mean([shot.success for shot in self.shots if not math.isnan(shot.filling_fraction)]).value
 
@@ -256,7 +258,8 @@ class Run:
             return self
         shots = select_shots(self, conditions)
         if not shots:
-            raise ConfigError(Problem(f"no shot meets {' and '.join(conditions)}", clean(self.path.name)))
+            what = f"no shot meets {visible(' and '.join(conditions))}"
+            raise ConfigError(Problem(what, clean(self.path.name)))
         scan = self.record.get("scan") or {}
         if scan and SCANNER not in scan:
             from labseq.data.points import reporting_damage, restricted

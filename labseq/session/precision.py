@@ -98,7 +98,8 @@ class Precision:
             if (error := call.error) is not None:
                 if isinstance(error.__cause__, PluginLoadError):
                     self._give_up(str(error.__cause__))
-                elif not isinstance(error, ConfigError | RecordingError):  # the shots are good
+                elif not isinstance(error, ConfigError | RecordingError):
+                    # the shots are good, whatever is wrong with the fit
                     self._give_up(format_error(error))
                 return ""  # more shots may give a fit
             results += call.result
