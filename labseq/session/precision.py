@@ -75,7 +75,7 @@ class Precision:
         ]
         for row in rows:
             self._add(row)
-            self._is_due()  # so that a resumed run makes the fits that it would have made anyway
+            self._takes_turn()  # so that a resumed run makes the fits that it would have made anyway
 
     def after(self, row: IndexRow) -> str:
         """Judge the fits after a shot that was taken.
@@ -87,7 +87,7 @@ class Precision:
             StopRequested: The run was asked to stop during the fit.
         """
         self._add(row)
-        if not self._is_due():
+        if not self._takes_turn():
             return ""
         results: list[str] = []
         for aim in self._aims:
@@ -105,8 +105,8 @@ class Precision:
             results += call.result
         return f"stop_when reached: {', '.join(results)}" if all(results) else ""
 
-    def _is_due(self) -> bool:
-        """Whether the fits are made now, after a whole round of the points; they are then made later again."""
+    def _takes_turn(self) -> bool:
+        """Whether the fits are made now, after a whole round of the points; if so, sets when the next are."""
         is_due = self._n_shots >= self._next and not self._n_shots % len(self._points)
         if is_due:
             self._next = GROWTH * self._n_shots
