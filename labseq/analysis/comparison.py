@@ -49,7 +49,7 @@ class Compared:
         quantity: The quantity.
         mean: Its mean over all shots.
         axis: The scanned address; None without a scan of one numerical value.
-        x: The scanned value at each point, in the unit of the axis.
+        x: The scanned value at each point, in the unit of the axis, rising.
         means: The quantity at each point.
         fit: The fit that the run's sequence asks for; None if it asks for none or it failed.
         result: The parameter of it that the sequence asks for.
@@ -76,8 +76,11 @@ class Compared:
         on_axis = scan.on_axis(0) if scan is not None and len(scan.axes) == 1 else None
         means = [] if scan is None else scan.over(quantity)
         fits = own_fits(run, scan, quantity, means) if scan is not None and on_axis else []
-        x, axis = ([], None) if scan is None or on_axis is None else (on_axis[0], scan.axes[0])
         fit, result = (fits[0].fit, reported(run, quantity, fits[0])) if fits else (None, None)
+        x, axis = list[float](), None
+        if scan is not None and on_axis is not None:
+            axis, order = scan.axes[0], np.argsort(on_axis[0], kind="stable")
+            x, means = [on_axis[0][i] for i in order], [means[i] for i in order]
         return cls(read_entry(run.path), quantity, quantity.over(run.shots), axis, x, means, fit, result)
 
 

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from labseq.data import Run
+from labseq.analysis.comparison import Compared
+from labseq.data import Run, open_run
 from labseq.files import write_file
 
 DAYS = ("2026-11-20", "2026-11-21", "2026-11-28")
@@ -44,6 +45,20 @@ def test_runs_are_compared_by_their_fits(data: Path, call: Any) -> None:
     assert picture.stat().st_size > 10_000
     code, _, err = call("compare", "7", "--scan", "survival:before,afer")
     assert (code, "there is no image 'afer'" in err) == (2, True)
+
+
+def test_points_are_in_the_order_of_their_values(data: Path) -> None:
+    file = data / "data" / DAYS[0] / "0007_lifetime" / "run.json"
+    rising = Compared.of(open_run(file), "loading")
+    record = json.loads(file.read_text("utf-8"))
+    scan = record["scan"]
+    last = len(scan["points"]) - 1
+    scan |= {"points": scan["points"][::-1], "written": scan["written"][::-1]}
+    scan["point_of_shot"] = [last - point for point in scan["point_of_shot"]]
+    file.write_text(json.dumps(record), "utf-8")
+    falling = Compared.of(open_run(file), "loading")
+    assert falling.x == rising.x == sorted(rising.x)
+    assert falling.means == rising.means
 
 
 def test_runs_with_different_scans_are_not_overlaid(data: Path, call: Any, compact: Run) -> None:
