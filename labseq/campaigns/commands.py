@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from labseq.campaigns.campaign import Campaign, PlannedRun
+    from labseq.campaigns.campaign import Campaign, PlannedRun, Point
     from labseq.data import Run
 
 campaign = typer.Typer(
@@ -88,17 +88,26 @@ def run_file(
     else:
         alarms = run_in_turn(run_session, wanted, folder)
     _, runs = recorded_runs(folder)
+    n_runs = plural(sum(map(len, runs.values())), "run")
+    say("", *aligned(_rows(wanted, runs, results_of)), f"{n_runs} in {folder}")
+    if alarms:
+        text = f"{alarms[0].text}; in all, alarms ended {len(alarms)} of {n_runs}, the others went on"
+        raise AlarmError(alarms[0].alarm, text, alarms[0].n_shots)
+
+
+def _rows(
+    wanted: Campaign,
+    runs: Mapping[Point, Sequence[Run]],
+    results_of: Callable[[Sequence[Run]], Mapping[str, str]],
+) -> list[tuple[str, ...]]:
+    """A row for each point of a campaign, with what its runs measure, below the heads of the columns."""
     results = {point: results_of(runs[point]) for point in wanted.points()}
     names = [*dict.fromkeys(name for means in results.values() for name in means)]
     rows: list[tuple[str, ...]] = [(*wanted.axes, "shots", *names, "runs")]
     for point, means in results.items():
         measured = [means.get(name, "-") for name in names]
         rows.append((*wanted.values(point), _n_shots(runs[point]), *measured, _names(runs[point])))
-    n_runs = plural(sum(map(len, runs.values())), "run")
-    say("", *aligned(rows), f"{n_runs} in {folder}")
-    if alarms:
-        text = f"{alarms[0].text}; in all, alarms ended {len(alarms)} of {n_runs}, the others went on"
-        raise AlarmError(alarms[0].alarm, text, alarms[0].n_shots)
+    return rows
 
 
 def _reporter(

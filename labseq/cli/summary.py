@@ -172,9 +172,9 @@ class Summary:
     def as_text(self) -> list[str]:
         """A table of the points or cycles, and the statistics."""
         tables = self.scan.table(MAX_ROWS) if self.scan else cycle_table(self.statistics)
-        ended_early = self.status in ("stopped", "failed") and self.shots + self.skipped < self.n_shots
+        has_missing = self.status in ("stopped", "failed") and self.shots + self.skipped < self.n_shots
         resume = (
-            [f"resume it with: labseq resume {quoted(self.run_dir)}"] if self.run_dir and ended_early else []
+            [f"resume it with: labseq resume {quoted(self.run_dir)}"] if self.run_dir and has_missing else []
         )
         return [*tables, *([""] if tables else []), *aligned(self._facts()), *resume]
 
@@ -187,7 +187,7 @@ class Summary:
             *self._about(),
             ("status", f"failed: {self.error}" if self.error and self.status == "failed" else self.status),
             ("shots", f"{self.shots} of {self.n_shots}{skipped}{kept}"),
-            *([("ended early", clean(self.ended_early))] if self.ended_early else []),
+            *([("ended early", one_line(self.ended_early))] if self.ended_early else []),
             *_skipped_rows(self.skipped_shots),
             *_best_rows(self.best),
             *(statistics_rows(self.statistics) if self.has_target else _atom_rows(self.n_atoms)),
@@ -342,7 +342,7 @@ def _skipped_rows(skipped: Sequence[SkippedShots]) -> Facts:
     rows = [
         (
             "skipped",
-            f"{'shot' if len(group.shots) == 1 else 'shots'} {_numbers(group.shots)}: {clean(group.why)}",
+            f"{'shot' if len(group.shots) == 1 else 'shots'} {_numbers(group.shots)}: {one_line(group.why)}",
         )
         for group in skipped[:MAX_LISTED]
     ]

@@ -309,6 +309,6 @@ def _flags() -> int:
 
 
 def _analysis_of(name: str, analyses: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """The analysis whose results a quantity is one of; names may contain dots."""
-    found = [one for one in analyses if name.startswith(f"{RESULT_PREFIX}{one[USE]}.")]
-    return max(found, key=lambda one: len(str(one[USE])))
+    """The analysis whose results a quantity is one of."""
+    use = name.removeprefix(RESULT_PREFIX).partition(".")[0]
+    return next(analysis for analysis in analyses if analysis[USE] == use)
