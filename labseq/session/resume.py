@@ -267,7 +267,7 @@ def taken_again(path: Path, given: Options, *, same_seed: bool) -> tuple[Assembl
     options = Options.of(run.changes, realtime=given.realtime)
     options = replace(
         options,
-        shots=given.shots or options.shots,
+        shots=options.shots if given.shots is None else given.shots,
         seed=run.seed if same_seed else None,
         output=given.output,
         note=given.note or f"rerun of {run.path.parent.name}/{run.path.name}",

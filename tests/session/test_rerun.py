@@ -72,5 +72,7 @@ def test_a_run_is_taken_again(tmp_path: Path) -> None:
     (first.path / "run.json").write_text(json.dumps(record), "utf-8")
     other = labseq.Session.rerun(first.path, shots=2, output=tmp_path, observer=seen).run()
     assert (other.n_shots, other.seed == first.seed) == (2, False)
+    with pytest.raises(ConfigError, match="shots is 0"):
+        labseq.Session.rerun(first.path, shots=0)
     (text,) = [values["text"] for values in seen.of("warning") if "other than" in values["text"]]
     assert text == f"other than in {first.path.name}: labseq was 0.1.9, is {labseq.__version__}"
