@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.errors import RecordingError
-from labseq.files import open_ordinary
 from labseq.model import CycleRecord, ImageRecord, Plan, ShotRecord, StageTiming, StepTiming, TargetPattern
 from labseq.model.records import LineEdge, ShotStatus
-from labseq.recording.index import IndexRow
+from labseq.recording.index import IndexRow, digest_of
 
 if TYPE_CHECKING:
     from labseq.recording.shot_file import ShotContent
@@ -222,8 +220,7 @@ class Shot:
             RecordingError: A byte has changed since it was written.
         """
         try:
-            with open_ordinary(self.file) as file:
-                sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+            sha256 = digest_of(self.file).sha256
         except OSError as error:
             raise RecordingError(self.file, f"cannot be read: {error.strerror}", "check the disk") from error
         if sha256 != self.row.sha256:

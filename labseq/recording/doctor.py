@@ -6,8 +6,6 @@ Nothing is deleted: files that do not belong are moved to the folder ``quarantin
 
 from __future__ import annotations
 
-import hashlib
-import os
 import re
 import time
 from collections.abc import Callable, Collection, Iterator
@@ -23,7 +21,6 @@ from labseq.files import (
     explained,
     lines_in,
     make_folder,
-    open_ordinary,
     sync_folder,
     write_file,
 )
@@ -31,7 +28,7 @@ from labseq.model.image_quantities import measured_in
 from labseq.plain import dumps, now_utc, parse_object
 from labseq.processes import Lock, Process
 from labseq.recording import folders
-from labseq.recording.index import SHOT_FILE, IndexRow, row_of_line, row_of_record
+from labseq.recording.index import SHOT_FILE, IndexRow, digest_of, row_of_line, row_of_record
 from labseq.recording.markers import Marker, markers
 from labseq.recording.run_file import (
     STATUSES,
@@ -346,7 +343,7 @@ class _Check:
         numbers, last = [*rows], [*rows.values()][-1]
         path = self.folder / last.file
         try:
-            n_bytes, sha256, is_marked = _size_and_hash(path)
+            n_bytes, sha256, is_marked = digest_of(path)
         except FileNotFoundError:
             index.remove(numbers)
             remedy = "its line moved to quarantine; if you find the file, put it back and run this again"
@@ -387,7 +384,7 @@ class _Check:
             content = read_content(path)
             for _ in iter_frames(path):  # each must be readable
                 pass
-            n_bytes, sha256, _ = _size_and_hash(path)
+            n_bytes, sha256, _ = digest_of(path)
             with damage_reported(path):
                 row = row_of_record(
                     content.record,
@@ -441,21 +438,6 @@ class _Check:
                 return False
         self.findings.append(Finding(what, where, done, left=repair is None or self._dry_run))
         return repair is not None
-
-
-_OPEN_FOR_WRITING: Final = b"\1\0\0\0"
-"""What HDF5 writes after byte 20 of a file while a program has it open for writing, in place of zeros."""
-
-
-def _size_and_hash(path: Path) -> tuple[int, str, bool]:
-    """Size of a shot's file, its SHA-256 without HDF5's mark, and whether a program has marked it as open."""
-    with open_ordinary(path) as file:
-        head = file.read(24)
-        is_marked = head[:9] == b"\x89HDF\r\n\x1a\n\0" and head[20:] == _OPEN_FOR_WRITING
-        digest = hashlib.sha256(head[:20] + bytes(4) if is_marked else head)
-        while chunk := file.read(1 << 20):
-            digest.update(chunk)
-        return os.fstat(file.fileno()).st_size, digest.hexdigest(), is_marked
 
 
 def _is_locked(path: Path) -> bool:

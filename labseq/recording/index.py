@@ -6,19 +6,21 @@ without opening their files.
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
 import re
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from numbers import Real
 from pathlib import Path
-from typing import Any, Final, TypeVar, cast, get_type_hints
+from typing import Any, Final, NamedTuple, TypeVar, cast, get_type_hints
 
 import numpy as np
 
 from labseq.errors import RecordingError
-from labseq.files import NewLines
+from labseq.files import NewLines, open_ordinary
 from labseq.model import ShotRecord, TargetPattern
 from labseq.model.image_quantities import OF_IMAGES, Events, events_of, parse_name
 from labseq.model.records import STEP, ShotStatus
@@ -32,7 +34,39 @@ SIMULATION: Final = "simulation."
 SHOT_FILE: Final = re.compile(SHOTS_FOLDER + r"/shot_\d{6,}(\.attempt_\d+)?(\.take_(\d+))?\.h5")
 """A shot's file in a line of the index."""
 
+_OPEN_FOR_WRITING: Final = b"\1\0\0\0"
+"""What HDF5 writes after byte 20 of a file while a program has it open for writing, in place of zeros."""
+
 _T = TypeVar("_T")
+
+
+class ShotDigest(NamedTuple):
+    """What tells whether a shot's file is as it was written.
+
+    Attributes:
+        n_bytes: Its size.
+        sha256: Its SHA-256 without HDF5's mark, in hexadecimal, as the index has it.
+        is_marked: Whether a program has it open for writing, or had when it died.
+    """
+
+    n_bytes: int
+    sha256: str
+    is_marked: bool
+
+
+def digest_of(path: Path) -> ShotDigest:
+    """Read a shot's file for its digest; a program that opens it for writing has not changed it by that.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    with open_ordinary(path) as file:
+        head = file.read(24)
+        is_marked = head[:9] == b"\x89HDF\r\n\x1a\n\0" and head[20:] == _OPEN_FOR_WRITING
+        digest = hashlib.sha256(head[:20] + bytes(4) if is_marked else head)
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+        return ShotDigest(os.fstat(file.fileno()).st_size, digest.hexdigest(), is_marked)
 
 
 @dataclass(frozen=True, slots=True)

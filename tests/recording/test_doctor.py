@@ -115,6 +115,8 @@ def test_what_a_viewer_has_open_for_writing_stays(run_dir: Path, mode: Literal["
         assert [(finding.where, finding.left) for finding in report.findings] == [
             (file, False) for file in files
         ]
+        for shot in open_run(run_dir).shots:
+            shot.verify()
         viewed[0]["entry"].attrs["comment"] = "seen"
         viewed[0].flush()
         (changed, *others) = examine(run_dir).findings
