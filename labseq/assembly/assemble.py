@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from labseq.assembly.options import DryRun, Options
+from labseq.assembly.options import Options
 from labseq.assembly.plugin_choice import (
     ChosenPlugin,
     construct_one,
@@ -19,7 +19,7 @@ from labseq.assembly.plugin_choice import (
 )
 from labseq.assembly.point import Point, make_step, place_note
 from labseq.assembly.profile import ResolvedProfile, resolve_profile
-from labseq.config.addresses import PROFILE_ROLES, split_overrides
+from labseq.config.addresses import PROFILE, PROFILE_ROLES, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths
 from labseq.config.find import find_sequence
 from labseq.config.sequence import SequenceSpec, load_sequence
@@ -68,11 +68,6 @@ class Assembly:
     scanned: ScanPoints | None = None
     policy: RunPolicy = field(default_factory=RunPolicy)
     search: Search | None = None
-
-    @property
-    def dry_run(self) -> DryRun:
-        """Whether devices are replaced: "off", "full" or "fast"."""
-        return self.hardware.dry_run
 
     @property
     def virtual_time(self) -> bool:
@@ -139,7 +134,7 @@ def assemble(
     profile, dry_run = options.profile, options.dry_run
     sequence_path = sequence_path if kept is not None else find_sequence(sequence_path)
     for_sequence, for_profile = split_overrides(options.overrides)
-    profile_set = [override._replace(address=f"profile.{override.address}") for override in for_profile]
+    profile_set = [override._replace(address=f"{PROFILE}{override.address}") for override in for_profile]
     problems = ProblemCollector()
     try:
         document, sequence, scan = load_sequence(
@@ -166,7 +161,8 @@ def assemble(
         )
     except ConfigError as error:
         _check_alone(document, sequence, problems)
-        raise _explained(problems.stop(error), scan) from None
+        error = problems.stop(error)
+        raise (error if scan is None else scan.explained(error)) from None
     return _assembled(document, sequence, hardware, scan, problems)
 
 
@@ -187,12 +183,7 @@ def _assembled(
     is_whole = not problems.problems
     objects: dict[str, Any] = {}
     with problems:
-        pattern, objects["target_dump"] = make_target(hardware, document, sequence)
-        if sequence.regions:
-            from labseq.assembly.regions import with_regions  # loads what other runs do not need
-
-            pattern = with_regions(pattern, hardware, document, sequence.regions)
-        objects["target"] = pattern
+        objects["target"], objects["target_dump"] = make_target(hardware, document, sequence)
     with problems:
         objects["planner"] = resolve(hardware.host, document, "planner", sequence.planner)
     steps, step_dumps = make_steps(hardware, document, sequence, problems)
@@ -216,10 +207,10 @@ def _assembled(
 
             scanned = ScanPoints(scan.bound(hardware.document), document, sequence, hardware)
             scanned.check(problems)
-            search = make_search(scanned, steps, results, objects["target"], problems)
+            search = make_search(scanned, steps, results, target, problems)
         problems.raise_any()
     except ConfigError as error:
-        raise _explained(error, scan) from None
+        raise (error if scan is None else scan.explained(error)) from None
     target, planner = objects["target"], objects["planner"]
     resolved = {
         **sequence.model_dump(
@@ -232,16 +223,10 @@ def _assembled(
         "analysis": analyses,
         "profile": _profile_dump(hardware),
     }
-    if target.regions:
-        resolved["regions"] = plain_regions(target)
-    if texts := _expressions(document, hardware.document):
-        resolved["expressions"] = texts
+    optional = {"regions": plain_regions(target), "expressions": _expressions(document, hardware.document)}
+    resolved |= {key: value for key, value in optional.items() if value}
     parts = (document, sequence, hardware, target, planner, tuple(steps), resolved)
     return Assembly(*parts, scanned, policy=policy, search=search)
-
-
-def _explained(error: ConfigError, scan: Scan | None) -> ConfigError:
-    return error if scan is None else scan.explained(error)
 
 
 def _check_alone(document: Document, sequence: SequenceSpec, problems: ProblemCollector) -> None:
@@ -261,11 +246,11 @@ def _check_alone(document: Document, sequence: SequenceSpec, problems: ProblemCo
 
 def _expressions(sequence: Document, profile: Document) -> dict[str, str]:
     """Address -> text of each expression; the record of the run has its value among the settings."""
-    texts: dict[str, str] = {}
-    for prefix, document in (("", sequence), ("profile.", profile)):
-        for loc, text in ({} if document.expressions is None else document.expressions.texts).items():
-            texts[prefix + ".".join(map(str, loc))] = text
-    return texts
+    return {
+        prefix + ".".join(map(str, loc)): text
+        for prefix, document in (("", sequence), (PROFILE, profile))
+        for loc, text in (document.expressions.texts.items() if document.expressions else ())
+    }
 
 
 def _profile_dump(hardware: ResolvedProfile) -> dict[str, Any]:
@@ -289,24 +274,35 @@ def _profile_dump(hardware: ResolvedProfile) -> dict[str, Any]:
 def make_target(
     hardware: ResolvedProfile, document: Document, sequence: SequenceSpec
 ) -> tuple[TargetPattern, dict[str, Any] | None]:
-    """The target of a sequence, and its settings for the record; without one, the target that asks nothing.
+    """The target of a sequence with its regions, and its settings for the record.
+
+    A sequence without a target has one that asks nothing.
 
     Raises:
-        ConfigError: The pattern is unknown, its settings are invalid, or it does not fit on the grid.
+        ConfigError: A pattern is unknown, has invalid settings, or does not fit on the grid; or a region does
+            not.
         PluginLoadError: The pattern's plugin failed; names it.
     """
     choice, grid = sequence.target, hardware.grid
-    if choice is None:
-        return TargetPattern.none(grid.shape), None
-    chosen = resolve(hardware.host, document, "pattern", choice)
-    try:
-        target = construct_target(chosen, grid)
-    except PluginLoadError:
-        raise
-    except LabseqError as error:
-        problem = document.problem(choice.loc, str(error))
-        raise ConfigError(replace(problem, notes=(_grid_note(hardware),))) from error
-    return target, {"pattern": chosen.entry.name, **dump(chosen.entry, chosen.settings)}
+    target, dumped = TargetPattern.none(grid.shape), None
+    if choice is not None:
+        chosen = resolve(hardware.host, document, "pattern", choice)
+        try:
+            target = construct_target(chosen, grid)
+        except PluginLoadError:
+            raise
+        except LabseqError as error:
+            note = (
+                f"the grid has {grid.n_rows} x {grid.n_cols} sites: {place_note(hardware.document, 'grid')}"
+            )
+            problem = document.problem(choice.loc, str(error))
+            raise ConfigError(replace(problem, notes=(note,))) from error
+        dumped = {"pattern": chosen.entry.name, **dump(chosen.entry, chosen.settings)}
+    if sequence.regions:
+        from labseq.assembly.regions import with_regions  # loads what other runs do not need
+
+        target = with_regions(target, hardware, document, sequence.regions)
+    return target, dumped
 
 
 def make_steps(
@@ -430,8 +426,3 @@ def make_measures(
 
                 check_fit(document, sequence, scan, number, target, host)
     return [measure.model_dump(mode="json", exclude_defaults=True) for measure in sequence.measure]
-
-
-def _grid_note(hardware: ResolvedProfile) -> str:
-    grid = hardware.grid
-    return f"the grid has {grid.n_rows} x {grid.n_cols} sites: {place_note(hardware.document, 'grid')}"

@@ -158,7 +158,7 @@ def make_search(
     corners: ScanPoints,
     steps: Sequence[tuple[str, Step]],
     results: Collection[str],
-    target: TargetPattern,
+    target: TargetPattern | None,
     problems: ProblemCollector,
 ) -> Search | None:
     """Choose and check the scanner of a scan; None if its points are listed, or if there is a problem.
@@ -168,7 +168,7 @@ def make_search(
     Args:
         corners: The points of the scan, checked: of an adaptive scan, the corners of its ranges.
         results: Names of the results of the analyses, see :func:`labseq.assembly.quantities.check_quantity`.
-        target: The target of the sequence.
+        target: The target of the sequence; None if it has errors.
     """
     scan = corners.scan
     if not isinstance(scan, AdaptiveScan) or problems.problems:

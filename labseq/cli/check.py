@@ -268,7 +268,7 @@ def _subject(assembly: Assembly) -> Facts:
     grid, document = assembly.hardware.grid, assembly.hardware.document
     listed = settings_text({k: v for k, v in assembly.planner.dump().items() if k != "use"})
     sites = f"{plural(target.n_atoms, 'atom')}, {plural(int(target.clear.sum()), 'site')} to be empty"
-    simulated = ", dry run" if assembly.dry_run != "off" else ", simulated" * assembly.virtual_time
+    simulated = ", dry run" if assembly.hardware.dry_run != "off" else ", simulated" * assembly.virtual_time
     return [
         ("sequence", f"{spec.name} ({assembly.document.path})"),
         ("profile", f"{assembly.hardware.profile.name} ({document.path}){simulated}"),

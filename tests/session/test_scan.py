@@ -161,6 +161,11 @@ def test_every_wrong_value_is_reported_with_its_place(tmp_path: Path, text: str,
         assert f"{problem.column}: {problem.what} ({(*problem.notes, '')[0]})".startswith(message)
 
 
+def test_a_target_that_does_not_fit_is_reported_in_a_scan_too(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="the size of the target is 100 rows"):
+        open_scan(tmp_path, "scan: {shot.sort.cycles: [2, 3]}\n", overrides=["target.rows=100"])
+
+
 def test_after_many_wrong_values_no_further_point_is_tried(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         open_scan(tmp_path, f"scan: {{shot.sort.cycles: {list(range(-3 * MAX_PROBLEMS, 0))}}}\n")
