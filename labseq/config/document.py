@@ -52,13 +52,12 @@ class Expressions:
     reads: Mapping[Loc, frozenset[Loc]]
 
     def following(self, loc: Loc) -> list[Loc]:
-        """The expressions that depend on a value, or on a part of it."""
-        return [reader for reader, read in self.reads.items() if any(_overlap(loc, other) for other in read)]
-
-
-def _overlap(loc: Loc, other: Loc) -> bool:
-    n = min(len(loc), len(other))
-    return loc[:n] == other[:n]
+        """The expressions that depend on a value, on a part of it, or on the mapping or list that has it."""
+        return [
+            reader
+            for reader, read in self.reads.items()
+            if any(loc[: len(other)] == other[: len(loc)] for other in read)
+        ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

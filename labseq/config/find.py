@@ -86,7 +86,9 @@ def find_sequence(given: Path) -> Path:
     if is_path(name) or given.suffix:
         packaged = packaged_sequences_dir() / given.name
         if is_file(packaged) and not is_file(given) and not something_else(given):
-            raise ConfigError(Problem("there is no such file", visible(name), hint=_hint_at(packaged)))
+            copied = "or copy it with 'labseq demo --copy .'"
+            hint = f"use '{packaged.stem}' for the one that comes with labseq, {copied}"
+            raise ConfigError(Problem("there is no such file", visible(name), hint=hint))
         return given
     folders = (Path(), Path(SEQUENCES), packaged_sequences_dir())
     path = given if is_file(given) else _named(name, folders)
@@ -97,10 +99,6 @@ def find_sequence(given: Path) -> Path:
     what = f"there is no sequence '{clean(name)}' in {places}"
     hint = did_you_mean(name, names) or alike_file(given)
     raise ConfigError(Problem(what, expected=listing(names) if names else "a file", hint=hint))
-
-
-def _hint_at(packaged: Path) -> str:
-    return f"use '{packaged.stem}' for the one that comes with labseq, or copy it with 'labseq demo --copy .'"
 
 
 def _named(name: str, folders: Sequence[Path]) -> Path | None:

@@ -73,7 +73,7 @@ class ValidationContext:
 
     def known_keys(self, model: SettingsType, loc: Loc) -> list[str]:
         """The keys of the mapping at a location."""
-        keys = keys_of(models_at(model, loc))
+        keys = [setting.key for one in models_at(model, loc) for setting in settings_of(one)]
         if not loc:
             keys = [*(key for key in keys if key not in self.drop), *self.other_keys]
         return list(dict.fromkeys(keys))
@@ -295,11 +295,6 @@ def _missing_item(loc: Loc, index: int, top: Node, context: ValidationContext) -
     n = len(node.value) if node and isinstance(node.value, list) else 0
     what = f"{context.value(loc)} has {n} {'entry' if n == 1 else 'entries'}"
     return Finding(loc, Problem(what, expected=f"at least {index + 1}"))
-
-
-def keys_of(models: list[SettingsType]) -> list[str]:
-    """The keys of the models, in order."""
-    return list(dict.fromkeys(setting.key for model in models for setting in settings_of(model)))
 
 
 def _description(settings: Sequence[Setting]) -> str:
