@@ -23,8 +23,8 @@ from labseq.cli import main
 from labseq.cli.devices import Plugins
 from labseq.config.document import Document
 from labseq.errors import LabseqError, PluginLoadError
-from labseq.plugins.calls import LOCAL_PACKAGE, call_plugin
-from labseq.plugins.host import PluginHost, PluginInfo
+from labseq.plugins.calls import call_plugin
+from labseq.plugins.host import LOCAL_PACKAGE, PluginHost, PluginInfo
 from labseq.registry import Entry, Owner
 from labseq.roles import Context
 

@@ -10,8 +10,7 @@ import pytest
 
 from labseq import hookspecs
 from labseq.errors import ConfigError, PluginLoadError, UnknownPluginError
-from labseq.plugins.calls import LOCAL_PACKAGE
-from labseq.plugins.host import PluginHost
+from labseq.plugins.host import LOCAL_PACKAGE, PluginHost
 from labseq.settings import Settings
 
 GOOD = """

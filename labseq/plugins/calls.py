@@ -1,8 +1,7 @@
-"""Calls of plugin code outside of a run: importing, registering, validating settings, constructing."""
+"""Calls of plugin code outside of a run: while it is loaded, validates settings or constructs."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import sys
 import traceback
@@ -10,10 +9,9 @@ from collections.abc import Callable
 from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
-from labseq.errors import LabseqError, PluginLoadError
+from labseq.errors import LabseqError
 from labseq.guard import Guard
 from labseq.messages import format_error, one_line
 
@@ -24,8 +22,6 @@ T = TypeVar("T")
 
 MAX_PRINTED: Final = 60
 """Maximum number of characters of a plugin's printed text that are quoted."""
-LOCAL_PACKAGE: Final = "labseq_local"
-"""Package of the modules of plugins from folders."""
 
 
 _guard = Guard()
@@ -135,43 +131,3 @@ def error_location(error: BaseException, home: Path | None) -> str:
     other_frames = [f for f in frames if not {Path(f.filename), Path(f.filename).parent} & callers]
     frame = (plugin_frames or other_frames or [None])[-1]
     return "" if frame is None else f"{frame.filename}:{frame.lineno}"
-
-
-def import_file(name: str, path: Path) -> ModuleType:
-    """Import a single file, or a package by its ``__init__.py``, as ``labseq_local.<name>``."""
-    if LOCAL_PACKAGE not in sys.modules:
-        sys.modules[LOCAL_PACKAGE] = ModuleType(LOCAL_PACKAGE)
-        sys.modules[LOCAL_PACKAGE].__path__ = []
-    full_name = f"{LOCAL_PACKAGE}.{name}"
-    path = path.absolute()  # Python remembers where a relative folder once was
-    inside = [str(path.parent)] if path.name == "__init__.py" else None
-    spec = importlib.util.spec_from_file_location(full_name, path, submodule_search_locations=inside)
-    if spec is None or spec.loader is None:
-        raise PluginLoadError(name, f"{path} is not a Python module")
-    forget(name)  # a module from another folder, or of an earlier version of the file
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[full_name] = module  # before execution, as dataclasses and relative imports need it
-    spec.loader.exec_module(module)
-    return module
-
-
-def forget(name: str) -> None:
-    """Remove the modules of a folder's plugin, so that they are imported again."""
-    full_name = f"{LOCAL_PACKAGE}.{name}"
-    for module in [m for m in sys.modules if m == full_name or m.startswith(f"{full_name}.")]:
-        del sys.modules[module]
-
-
-def plugin_location(path: Path) -> Path:
-    """The file of a folder's plugin, or the folder of its package."""
-    path = path.absolute()
-    return path.parent if path.name == "__init__.py" else path
-
-
-def module_location(name: str) -> Path | None:
-    """The folder of an installed package, or its file; None if unknown. Nothing is imported."""
-    try:
-        spec = importlib.util.find_spec(name.partition(".")[0])
-    except (ImportError, ValueError, AttributeError):
-        return None
-    return None if spec is None or spec.origin is None else plugin_location(Path(spec.origin))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import difflib
 import importlib.metadata
+import importlib.util
 import inspect
 import os
 import re
+import sys
 from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
@@ -24,13 +26,7 @@ from labseq.errors import ConfigError, LabseqError, PluginLoadError, Problem, Un
 from labseq.files import PLUGIN_PATH, PLUGINS
 from labseq.hookspecs import LABSEQ_API
 from labseq.messages import format_error
-from labseq.plugins.calls import (
-    call_plugin,
-    forget,
-    import_file,
-    module_location,
-    plugin_location,
-)
+from labseq.plugins.calls import call_plugin
 from labseq.registry import LOAD_S, Entry, Owner, Registry
 
 _MARK: Final = "labseq_impl"  # the attribute that ``hookimpl`` adds to a function
@@ -111,6 +107,8 @@ def _check_hook(key: str, function: Callable[..., object], owner: Owner) -> None
 
 
 ENTRY_POINT_GROUP: Final = "labseq"
+LOCAL_PACKAGE: Final = "labseq_local"
+"""Package of the modules of plugins from folders."""
 
 
 def plugin_files(folder: Path) -> list[Path]:
@@ -127,6 +125,46 @@ def plugin_files(folder: Path) -> list[Path]:
 def plugin_name(path: Path) -> str:
     """Name of the plugin in a file."""
     return path.parent.name if path.name == "__init__.py" else path.stem
+
+
+def import_file(name: str, path: Path) -> ModuleType:
+    """Import a single file, or a package by its ``__init__.py``, as ``labseq_local.<name>``."""
+    if LOCAL_PACKAGE not in sys.modules:
+        sys.modules[LOCAL_PACKAGE] = ModuleType(LOCAL_PACKAGE)
+        sys.modules[LOCAL_PACKAGE].__path__ = []
+    full_name = f"{LOCAL_PACKAGE}.{name}"
+    path = path.absolute()  # Python remembers where a relative folder once was
+    inside = [str(path.parent)] if path.name == "__init__.py" else None
+    spec = importlib.util.spec_from_file_location(full_name, path, submodule_search_locations=inside)
+    if spec is None or spec.loader is None:
+        raise PluginLoadError(name, f"{path} is not a Python module")
+    forget(name)  # a module from another folder, or of an earlier version of the file
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[full_name] = module  # before execution, as dataclasses and relative imports need it
+    spec.loader.exec_module(module)
+    return module
+
+
+def forget(name: str) -> None:
+    """Remove the modules of a folder's plugin, so that they are imported again."""
+    full_name = f"{LOCAL_PACKAGE}.{name}"
+    for module in [m for m in sys.modules if m == full_name or m.startswith(f"{full_name}.")]:
+        del sys.modules[module]
+
+
+def plugin_location(path: Path) -> Path:
+    """The file of a folder's plugin, or the folder of its package."""
+    path = path.absolute()
+    return path.parent if path.name == "__init__.py" else path
+
+
+def module_location(name: str) -> Path | None:
+    """The folder of an installed package, or its file; None if unknown. Nothing is imported."""
+    try:
+        spec = importlib.util.find_spec(name.partition(".")[0])
+    except (ImportError, ValueError, AttributeError):
+        return None
+    return None if spec is None or spec.origin is None else plugin_location(Path(spec.origin))
 
 
 def advice(kind: str, name: str, file: Path | None) -> str:
