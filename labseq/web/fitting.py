@@ -11,7 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from labseq.data import Run
-from labseq.data.fits import Parameter, readable
+from labseq.data.fits import Parameter
+from labseq.data.numbers import readable
 from labseq.data.quantities import Quantity
 from labseq.data.scanned import FitAt, Scanned, fits_along, request_of
 from labseq.errors import ConfigError
