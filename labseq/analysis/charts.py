@@ -229,7 +229,7 @@ def draw_map(
 
     low, high = limits
     if high <= low:  # all values are the same
-        low = high - (0.01 * abs(high) or 1.0)
+        low, high = (high - 0.01 * abs(high), high) if high else (0.0, 1.0)
     image = axes.imshow(
         np.ma.masked_invalid(values),
         origin="lower",

@@ -5,7 +5,8 @@ import { count, el, patch, percent, percentWithError, table, withError } from ".
 const OF_TARGET = { filling: "Filling", defect_free: "Defect-free" };  // every run with a target has these
 export const isOfTarget = (quantity) => quantity.name in OF_TARGET;
 export const titleOf = (quantity) => OF_TARGET[quantity.name] ?? quantity.title;
-export const shortName = (address) => address.split(" with ").map((one) => one.split(".").pop()).join(" with ");
+// The end of an address: "duration", "offset.0"
+export const shortName = (address) => address.split(" with ").map((one) => one.match(/[^.]*(\.\d+)*$/)[0]).join(" with ");
 
 export const axisName = (axis) => `${shortName(axis.address)}${axis.unit ? ` in ${axis.unit}` : ""}`;
 

@@ -4,7 +4,7 @@ import { drawArray, drawFrame } from "./array.js";
 import { bars, closeCharts, progressBar, stageBar } from "./charts.js";
 import { clock, count, el, facts, localTime, panel, patch, percent, percentWithError, post, replace, runLink, runPath, statusPill, table, time, withError } from "./dom.js";
 import { follow, oneSlot } from "./live.js";
-import { axisName, drawTrend, measuredTiles, parameterCurve, scanCurve, tile, titleOf } from "./measured.js";
+import { axisName, drawTrend, meanText, measuredTiles, parameterCurve, scanCurve, tile, titleOf } from "./measured.js";
 
 export async function showNow(main, _, asked) {
   const id = asked.get("run");
@@ -151,11 +151,12 @@ export function alarmList(alarms) {
 
 export function tilesOf(run, figures, measured, scan) {
   const [low, high] = figures.defect_free_interval, hasTarget = measured.some((one) => one.name === "defect_free");
+  const filling = measured.find((one) => one.name === "filling");  // also of shots that are not judged
   return [
     ...measuredTiles(measured, scan),
     ...(hasTarget ? [
-      tile("Defect-free", figures.n_judged ? percent(figures.defect_free) : "–", figures.n_judged ? `${figures.n_defect_free} of ${figures.n_judged}, ${(100 * low).toFixed(0)} to ${(100 * high).toFixed(0)} %` : "no judged shot yet", "is-green"),
-      tile("Filling", percentWithError(figures.filling, figures.filling_interval), `${count(run.target.n_atoms, "site")}, ${run.target.name}`, "is-blue"),
+      tile("Defect-free", figures.n_judged ? percent(figures.defect_free) : "–", figures.n_judged ? `${figures.n_defect_free} of ${figures.n_judged}, ${(100 * low).toFixed(0)} to ${(100 * high).toFixed(0)} %` : "no judged shot", "is-green"),
+      tile("Filling", figures.n_judged || !filling ? percentWithError(figures.filling, figures.filling_interval) : meanText(filling, filling), `${count(run.target.n_atoms, "site")}, ${run.target.name}`, "is-blue"),
       tile("Seen defect-free", run.n_done ? percent(figures.n_seen / run.n_done) : "–", `${figures.n_seen} of ${run.n_done}, in some image`),
     ] : []),
     hasTarget || figures.cycles ? tile("Cycles", figures.cycles === null ? "–" : figures.cycles.toFixed(1), "mean of a shot") : null,
