@@ -259,7 +259,14 @@ def _measured_rows(measured: Sequence[tuple[Quantity, Estimated]], *, is_judged:
     Of shots that are not judged, the filling of their last image is told here.
     """
     own = (one for one in measured if one[0].name not in (WITH_TARGET if is_judged else WITH_TARGET[1:]))
-    return [(title_of(quantity), value_text(mean, quantity)) for quantity, mean in own]
+    return [(title_of(quantity), _mean_text(quantity, mean)) for quantity, mean in own]
+
+
+def _mean_text(quantity: Quantity, mean: Estimated) -> str:
+    """A mean over the shots of a run; none has a value where the sequence names what is never read."""
+    if not math.isnan(mean.value):
+        return value_text(mean, quantity)
+    return f"no shot has it; labseq show --scan {clean(quantity.name)} names what there is"
 
 
 CYCLES: Final[Sequence[Column[CycleStatistics]]] = (

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from labseq.analysis.statistics import CycleStatistics, Statistics
-from labseq.cli.summary import NOT_JUDGED, cycle_table, statistics_rows
+from labseq.cli.summary import NOT_JUDGED, Summary, cycle_table, statistics_rows
+from labseq.data.quantities import make_quantity
 from labseq.model.estimate import Estimate, Rate
 
 pytestmark = pytest.mark.usefixtures("capsys")  # tables are as wide as the terminal
@@ -57,6 +58,18 @@ def test_shots_that_are_not_judged_are_said_not_to_be() -> None:
     printed = lines(defect_free=Rate(0, 0), filling=UNKNOWN, defects=())
     assert printed["defect-free"] == NOT_JUDGED
     assert printed["defects"] == "none in 1, 1 in 4, 2 in 15 shots, after 1 cycle"
+
+
+def test_what_a_run_measures_is_never_blank(fake: Any) -> None:
+    measured = [
+        (make_quantity("filling", fake.target()), Estimate(0.971, 0.003)),
+        (make_quantity("reading.laser.power_w", fake.target()), UNKNOWN),
+    ]
+    statistics = replace(STATISTICS, defect_free=Rate(0, 0), filling=UNKNOWN, defects=(), cycles=())
+    text = [" ".join(line.split()) for line in Summary(statistics=statistics, measured=measured).as_text()]
+    assert "filling 97.1(3) %" in text
+    needed = "no shot has it; labseq show --scan reading.laser.power_w names what there is"
+    assert f"reading.laser.power_w {needed}" in text
 
 
 def test_no_shots_are_no_reason_to_complain() -> None:
