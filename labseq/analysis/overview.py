@@ -42,7 +42,15 @@ from labseq.data import Run, Shot
 from labseq.data.fits import Fit
 from labseq.data.images import loading_map
 from labseq.data.numbers import readable
-from labseq.data.quantities import WITH_TARGET, Quantity, measured_by, quantity_of, steps_that_load
+from labseq.data.quantities import (
+    ANALYSE,
+    WITH_TARGET,
+    Quantity,
+    measured_by,
+    quantity_of,
+    steps_that_load,
+    why_no_results,
+)
 from labseq.data.results import own_fits
 from labseq.data.scanned import FitAt, Scanned, is_geometric, scanned
 from labseq.data.site_maps import SiteMap, site_map
@@ -376,6 +384,12 @@ def scan_picture(run: Run, request: ScanRequest) -> RunPicture:
         for (quantity, means), fits_of_quantity in zip(report.values, fits, strict=True)
     ]
     panels = [panel for row in rows for panel in row]
+    if not panels:
+        name = report.values[0][0].name
+        why = why_no_results(run, name)
+        raise cannot_draw(
+            run, why or f"no shot has a value of '{clean(name)}'", ANALYSE if why else "shots with it"
+        )
     return _picture(run, "the scan", [tuple(panels)] if len(panels) <= MAX_PANELS else rows)
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 from labseq.data.columns import DESCRIPTIONS, FRACTIONS, GROUPS, RESULT, quantities_in
 from labseq.data.shot import Shot
 from labseq.errors import ConfigError, Problem, RecordingError
-from labseq.messages import clean, closest, did_you_mean
+from labseq.messages import clean, closest, did_you_mean, visible
 from labseq.model import TargetPattern
 from labseq.model.estimate import Estimated, Rate, mean
 from labseq.model.image_quantities import (
@@ -31,7 +31,14 @@ from labseq.model.image_quantities import (
 )
 from labseq.recording.folders import RESULT_PREFIX
 from labseq.recording.index import IndexRow
-from labseq.recording.results import result_columns
+from labseq.recording.results import (
+    ERROR,
+    SHOT,
+    read_results,
+    result_columns,
+    results_file,
+    shots_with_result,
+)
 from labseq.recording.schema import unit_of
 
 if TYPE_CHECKING:
@@ -221,13 +228,33 @@ def find_quantity(run: Run, name: str) -> Quantity:
     Raises:
         ConfigError: The run has no such quantity; lists those that it has.
     """
+    if name in measured_by(run) and not name.startswith(RESULT_PREFIX):
+        return quantity_of(run, name)  # was checked before the run; reading names of images takes a while
     images = image_names(run) if parse_name(name).images else []
     problem = quantity_problem(name, column_names(run), images, run.target)
     if problem is not None:
+        if why := why_no_results(run, name):
+            raise ConfigError(Problem(why, visible(str(run.path)), expected=ANALYSE))
         message, expected, hint = problem
         raise ConfigError(Problem(message, clean(run.path.name), expected=expected, hint=hint))
     _check_no_load(run, name)
     return quantity_of(run, name)
+
+
+ANALYSE: Final = "results, which 'labseq analyse' computes where they are missing"
+
+
+def why_no_results(run: Run, name: str) -> str:
+    """Why no shot has a result of an analysis that the run's sequence lists; "" for other quantities."""
+    analysis = name.removeprefix(RESULT_PREFIX).partition(".")[0]
+    listed = [one.get("use") for one in (run.record.get("resolved") or {}).get("analysis") or ()]
+    if not name.startswith(RESULT_PREFIX) or analysis not in listed:
+        return ""
+    rows, _ = read_results(results_file(run.path, analysis))
+    if shots_with_result(rows):
+        return ""
+    failed = f": shot {rows[0][SHOT]}: {clean(str(rows[0][ERROR]))}" if rows else ""
+    return f"the analysis '{clean(analysis)}' has no result of any shot{failed}"
 
 
 WITH_TARGET: Final = ("filling", "defect_free")

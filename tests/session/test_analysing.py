@@ -126,6 +126,11 @@ def test_analyses_that_fail_leave_the_run_alone(tmp_path, monkeypatch):
     log = log_of(done, "fails").read_text()
     assert log.startswith("looking at 0\n")
     assert 'raise ValueError("too dark")' in log
+    for name, why in (("dies", ";"), ("nomapping", ": shot 0: TypeError: the result is int")):
+        with pytest.raises(ConfigError, match=f"the analysis '{name}' has no result of any shot{why}"):
+            done.quantity(f"analysis.{name}.filling")
+    with pytest.raises(ConfigError, match=r"there is no quantity 'analysis\.fails\.feeling'"):
+        done.quantity("analysis.fails.feeling")
 
     monkeypatch.chdir(tmp_path)
     Path("repaired").touch()

@@ -211,6 +211,8 @@ def test_a_scan_of_names_cannot_be_fitted(tmp_path: Path) -> None:
 
 
 FITS = """
+import threading
+
 import lmfit
 import numpy as np
 from labseq.plugin import hookimpl
@@ -226,10 +228,15 @@ def raises(t, life=20.0):
     return t / life["s"]
 
 
+def hangs(t, life=20.0):
+    threading.Event().wait()
+
+
 @hookimpl
 def labseq_register(registry):
     registry.fit("own", lambda: lmfit.Model(decays), {"life": "x"})
     registry.fit("broken", lambda: lmfit.Model(raises), {"life": "x"})
+    registry.fit("stuck", lambda: lmfit.Model(hangs), {"life": "x"})
 """
 
 
@@ -274,15 +281,22 @@ def test_a_resumed_run_ends_at_the_same_shot(tmp_path: Path) -> None:
     assert 66 < len(runs[0].shots) < 120
 
 
-@pytest.mark.parametrize(("fit", "warning"), [("linear", ""), ("broken", "raised TypeError")])
+@pytest.mark.parametrize(
+    ("fit", "name", "warning"),
+    [
+        ("linear", "slope", ""),
+        ("broken", "life", "raised TypeError"),
+        ("stuck", "life", "the fit stuck has not ended after"),
+    ],
+)
 def test_points_that_do_not_follow_or_a_broken_model_do_not_end_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fit: str, warning: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fit: str, name: str, warning: str
 ) -> None:
     (tmp_path / "fits.py").write_text(FITS, "utf-8")
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
-    name = {"linear": "slope", "broken": "life"}[fit]
-    limit = {"linear": "50 %", "broken": "50 %"}[fit]
-    measure = f"measure: [{{value: survival, fit: {fit}, stop_when: {{{name}: {limit}}}}}]\n"
+    if fit == "stuck":
+        monkeypatch.setattr("labseq.session.precision.MAX_FIT_S", 0.1)
+    measure = f"measure: [{{value: survival, fit: {fit}, stop_when: {{{name}: 50 %}}}}]\n"
     text = SCANNED.replace("repeats: 40", "repeats: 3") + measure + SURVIVAL
     with opened(tmp_path, text) as session:
         run = session.run()
