@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Literal
 
 import typer
 
-from labseq.files import PLUGIN_PATH, PROFILES, data_root, packaged_profiles_dir
+from labseq.files import PLUGIN_PATH, PROFILES, data_root, packaged_profiles_dir, packaged_sequences_dir
 
 _FILES: Final = ("sequence", "profile")
 MAX_RUNS: Final = 20
@@ -45,6 +45,16 @@ def profile_names(incomplete: str) -> list[str]:
     for folder in (Path(PROFILES), packaged_profiles_dir()):
         with suppress(OSError):
             names |= {path.stem for path in folder.iterdir() if path.suffix.lower() in (".yaml", ".yml")}
+    return sorted(name for name in names if name.startswith(incomplete))
+
+
+def measurements(incomplete: str) -> list[str]:
+    """Names of the sequences that come with labseq and fit what they measure."""
+    names = {
+        path.stem
+        for path in packaged_sequences_dir().glob("*.yaml")
+        if "    fit: " in path.read_text("utf-8")
+    }
     return sorted(name for name in names if name.startswith(incomplete))
 
 

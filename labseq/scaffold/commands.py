@@ -5,11 +5,12 @@ from typing import Annotated, Final
 
 import typer
 
-from labseq.console.options import Plugins, file_kinds, new_kinds, profile_names
+from labseq.console.options import Plugins, file_kinds, measurements, new_kinds, profile_names
 
 NEW_EXAMPLES: Final = """\b
 Examples:
   labseq new sequence first
+  labseq new sequence my_rabi --like rabi
   labseq new planner spiral
   labseq new camera mycam --package
 """
@@ -53,6 +54,15 @@ def new(
             autocompletion=profile_names,
         ),
     ] = None,
+    like: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="A measurement that comes with labseq, with which a new sequence begins: rabi, ramsey, "
+            "lifetime, release_recapture, trap_depth, ...",
+            autocompletion=measurements,
+        ),
+    ] = None,
     folder: Annotated[
         Path,
         typer.Option(
@@ -67,7 +77,7 @@ def new(
     """
     from labseq.scaffold.new import make_new
 
-    make_new(kind, name, folder, package=package, profile=profile)
+    make_new(kind, name, folder, package=package, profile=profile, like=like)
 
 
 def schema(

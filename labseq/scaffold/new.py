@@ -23,9 +23,10 @@ from typing import Final
 from labseq import __version__
 from labseq.assembly.plugin_choice import load_plugins
 from labseq.config.find import find_profile
+from labseq.console.options import measurements
 from labseq.console.output import say, write_text
 from labseq.errors import ConfigError, Problem
-from labseq.files import PLUGINS, packaged_profiles_dir
+from labseq.files import PLUGINS, packaged_profiles_dir, packaged_sequences_dir
 from labseq.messages import clean, did_you_mean, install_hint, listing, visible
 from labseq.plugins.host import PluginHost
 from labseq.registry import Registry
@@ -69,7 +70,9 @@ class CreatedFiles:
     commands: tuple[str, ...]
 
 
-def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str | None) -> None:
+def make_new(
+    kind: str, name: str, folder: Path, *, package: bool, profile: str | None, like: str | None
+) -> None:
     """Make a plugin, a sequence or a profile, and print its files and what to do next."""
     if kind not in (*ROLES, *FILE_KINDS):
         kinds = (*ROLES, *FILE_KINDS)
@@ -77,10 +80,11 @@ def make_new(kind: str, name: str, folder: Path, *, package: bool, profile: str 
         raise ConfigError(Problem(what, expected=listing(kinds), hint=did_you_mean(kind, kinds)))
     if package and kind in FILE_KINDS:
         raise ConfigError(Problem(f"--package does not apply to a {kind}", hint="leave it out"))
-    if profile is not None and kind != "sequence":
-        raise ConfigError(Problem(f"--profile does not apply to a {_called(kind)}", hint="leave it out"))
+    for option, value in (("--profile", profile), ("--like", like)):
+        if value is not None and kind != "sequence":
+            raise ConfigError(Problem(f"{option} does not apply to a {_called(kind)}", hint="leave it out"))
     if kind in FILE_KINDS:
-        created = make_file(kind, name, folder, profile=profile or "virtual")
+        created = make_file(kind, name, folder, profile=profile or "virtual", like=like)
     else:
         created = make_plugin(kind, name, folder, package=package)
     say(*lines_of(kind, name, created))
@@ -162,21 +166,28 @@ def _needed(commands: list[str], folder: Path) -> tuple[str, ...]:
     return (*install, *(c for c in commands if not (has_sequence and c == f"labseq new sequence {FIRST}")))
 
 
-def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtual") -> CreatedFiles:
+def make_file(
+    kind: FileKind, name: str, folder: Path, *, profile: str = "virtual", like: str | None = None
+) -> CreatedFiles:
     """Make a sequence or a profile that runs at once, and the schema that editors read with it.
 
     Args:
         name: Its name; the file is ``NAME.yaml``.
+        profile: The profile that a sequence names.
+        like: Name of a measurement that comes with labseq, with which a sequence begins.
 
     Raises:
-        ConfigError: The name is not allowed or taken, there is no such profile, or something cannot be
-            written.
+        ConfigError: The name is not allowed or taken, there is no such profile or measurement, or something
+            cannot be written.
     """
     host = _plugins_of(folder)
     check_file_name(kind, name, packaged_profiles_dir())
     find_profile(profile, folder)
     path, plugins, schema = folder / f"{name}.yaml", folder / PLUGINS, schema_path(kind, folder)
-    text = fill(read_template(f"{kind}.yaml"), {"name": name, "profile": profile})
+    if like is None:
+        text = fill(read_template(f"{kind}.yaml"), {"name": name, "profile": profile})
+    else:
+        text = measurement_text(like, name, profile)
     further: list[Path] = []
     with _reporting(path):
         if path.exists():
@@ -193,6 +204,23 @@ def make_file(kind: FileKind, name: str, folder: Path, *, profile: str = "virtua
         "profile": (f"labseq devices {name}", f"labseq new sequence {FIRST} --profile {name}"),
     }
     return CreatedFiles(path, (path, *further), commands[kind])
+
+
+def measurement_text(like: str, name: str, profile: str) -> str:
+    """The text of a sequence that measures as one that comes with labseq, with its own name and profile.
+
+    Raises:
+        ConfigError: There is no such sequence, or it fits nothing.
+    """
+    known = measurements("")
+    if like not in known:
+        what = f"there is no measurement '{clean(like)}' to begin with"
+        raise ConfigError(Problem(what, "--like", expected=listing(known), hint=did_you_mean(like, known)))
+    text = (packaged_sequences_dir() / f"{like}.yaml").read_text("utf-8")
+    for key, value in (("name", name), ("profile", profile)):
+        text = re.sub(rf"^{key}: .*$", f"{key}: {value}", text, count=1, flags=re.MULTILINE)
+    head, _, _ = read_template("sequence.yaml").partition("\n")
+    return fill(head, {}) + "\n" + text.replace(f"sequences/{like}.yaml", f"{name}.yaml")
 
 
 def check_plugin_name(kind: str, name: str, package: str, host: PluginHost) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from hypothesis import example, given, settings, strategies as st
 
+import labseq
+from labseq.console.options import measurements
 from labseq.errors import ConfigError
 from labseq.plugins.host import PluginHost
 from labseq.scaffold.new import check_file_name, check_plugin_name, make_file, make_plugin
@@ -74,6 +76,22 @@ def test_a_file_in_the_way_of_a_folder_is_reported(name: str, tmp_path: Path) ->
         make_file("sequence", "first", tmp_path)
     assert not (tmp_path / "first.yaml").exists()
     assert (tmp_path / name).read_text() == ""
+
+
+@pytest.mark.parametrize("like", measurements(""))
+def test_a_sequence_begins_with_a_measurement_that_comes_with_labseq(like: str, tmp_path: Path) -> None:
+    """Also outside the folder of that one, whose files it does not have."""
+    made = make_file("sequence", "mine", tmp_path, like=like)
+    with labseq.Session.open(made.path) as session:
+        assembly = session.assembly
+        assert assembly.sequence.name == "mine"
+        assert any("fit" in one for one in assembly.resolved["measure"])
+    assert f"{like}.yaml" not in made.path.read_text("utf-8")
+
+
+def test_a_measurement_that_there_is_not_is_answered_with_those_that_there_are(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no measurement 'raby'.*ramsey.*did you mean 'rabi'"):
+        make_file("sequence", "mine", tmp_path, like="raby")
 
 
 @given(name=st.text(max_size=50))
