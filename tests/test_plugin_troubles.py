@@ -20,7 +20,7 @@ import pytest
 import labseq
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_one, construct_target, read_settings
 from labseq.cli import main
-from labseq.cli.devices import Plugins
+from labseq.cli.plugins import Plugins
 from labseq.config.document import Document
 from labseq.errors import LabseqError, PluginLoadError
 from labseq.plugins.calls import call_plugin

@@ -538,7 +538,7 @@ def plugins(
     _plugins: Plugins = None,
 ) -> None:
     """List the plugins: what each offers, where it comes from, and why it was not loaded."""
-    from labseq.cli.devices import list_plugins
+    from labseq.cli.plugins import list_plugins
 
     list_plugins(profile, as_json=as_json)
 
