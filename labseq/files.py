@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import stat
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
@@ -81,6 +82,15 @@ def sync_folder(folder: Path) -> None:
             raise
     finally:
         os.close(handle)
+
+
+def free_bytes(folder: Path) -> int:
+    """Free space of the disk on which a folder is, or will be.
+
+    Raises:
+        OSError: The disk does not answer.
+    """
+    return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
 
 
 def make_folder(path: Path, *, is_new: bool = False) -> None:

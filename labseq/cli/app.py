@@ -56,6 +56,7 @@ from labseq.console.options import (
     dry_run_mode,
     profile_option,
     run_argument,
+    whole_number_option,
 )
 from labseq.plans.commands import PLAN_EXAMPLES, WAVEFORM_EXAMPLES, plan, waveform
 from labseq.queue.commands import queue
@@ -152,7 +153,7 @@ app.command(epilog=CALIBRATE_EXAMPLES, short_help="Calibrate sites, tones, timin
 @app.command(short_help="Run an example sequence on simulated hardware.")
 def demo(
     shots: Annotated[
-        int | None, typer.Option(metavar="N", help="Number of shots; default: 10.", show_default=False)
+        int | None, whole_number_option("Number of shots; default: 10.", show_default=False)
     ] = None,
     output: Output = None,
     copy: Annotated[
@@ -207,10 +208,8 @@ def resume(
     run: Annotated[Path, run_argument("The run's folder, name or number.")],
     shots: Annotated[
         int | None,
-        typer.Option(
-            metavar="N",
-            help="Give the run more shots, N in all; it may be complete. A scan begins again after its last "
-            "shot.",
+        whole_number_option(
+            "Give the run more shots, N in all; it may be complete. A scan begins again after its last shot."
         ),
     ] = None,
     accept_changes: Annotated[
@@ -236,7 +235,7 @@ def rerun(
     run: Annotated[Path, run_argument("The run's folder, name or number.")],
     same_seed: Annotated[bool, typer.Option("--same-seed", help="Take its random numbers, too.")] = False,
     shots: Annotated[
-        int | None, typer.Option(metavar="N", help="Number of shots, instead of that of the earlier run.")
+        int | None, whole_number_option("Number of shots, instead of that of the earlier run.")
     ] = None,
     output: Output = None,
     note: Note = "",

@@ -74,6 +74,28 @@ class DryRunKind(StrEnum):
     FAST = "fast"
 
 
+def whole_number(text: str) -> int:
+    """The value of an option, which is read as in a file: ``1e3`` is 1000.
+
+    Raises:
+        PydanticCustomError: It is not a whole number; typer reports it.
+    """
+    from pydantic_core import PydanticCustomError
+
+    from labseq.config.yaml_nodes import resolve
+
+    with suppress(ValueError):  # too many digits
+        number = resolve(text)
+        if type(number) is int:
+            return number
+    raise PydanticCustomError("int_parsing", "not a whole number")
+
+
+def whole_number_option(text: str, **settings: Any) -> Any:
+    """An option that takes a whole number, with its help text."""
+    return typer.Option(metavar="N", parser=whole_number, help=text, **settings)
+
+
 def profile_option(text: str) -> Any:
     """The option ``--profile`` with another help text."""
     return typer.Option("--profile", "-p", metavar="NAME|FILE", help=text, autocompletion=profile_names)
@@ -167,12 +189,9 @@ SequenceFile = Annotated[
         show_default=False,
     ),
 ]
-Shots = Annotated[
-    int | None, typer.Option(metavar="N", help="Number of shots, instead of the sequence's own.")
-]
+Shots = Annotated[int | None, whole_number_option("Number of shots, instead of the sequence's own.")]
 Seed = Annotated[
-    int | None,
-    typer.Option(metavar="N", help="Seed of all random numbers; the same seed gives the same run."),
+    int | None, whole_number_option("Seed of all random numbers; the same seed gives the same run.")
 ]
 Output = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder for the data, instead of LABSEQ_DATA or ./data.")

@@ -100,7 +100,10 @@ class EntryRow:
     @property
     def options_text(self) -> str:
         """The options that differ from their defaults."""
-        values = [f"{address}={value}" for address, value in self.options.changes().items()]
+        changes = self.options.changes()
+        if self.options.profile is not None:  # of a path, the name is enough here
+            changes["profile"] = Path(self.options.profile).stem
+        values = [f"{address}={value}" for address, value in changes.items()]
         return clean(", ".join([*values, *rule_texts(self.rules)]))
 
     @property

@@ -22,8 +22,8 @@ from labseq.console.errors import exit_code_of, report, warning_lines
 from labseq.console.output import say
 from labseq.console.text import clock_time, plural
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, StopRequested
-from labseq.files import data_root, explained
-from labseq.messages import clean, did_you_mean, listing
+from labseq.files import data_root, explained, free_bytes
+from labseq.messages import clean, did_you_mean, listing, visible
 from labseq.model import CALIBRATION_KINDS
 from labseq.plain import now, now_utc
 from labseq.processes import Process
@@ -34,10 +34,12 @@ from labseq.session.check import CheckReport, check
 from labseq.session.notices import Notices
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop
-from labseq.units import parse_quantity
+from labseq.units import parse_quantity, size_text
 
 POLL_S: Final = 0.5
-"""Time between two looks for new entries while the queue waits, in seconds."""
+"""Time between two looks for new entries, or for room on the disk, while the queue waits, in seconds."""
+ROOM_BYTES: Final = 100_000_000
+"""Least free space of the disk with which an entry begins: with less, each would fail at its first shots."""
 
 Opening = Callable[[RunObserver | None], Session]
 """Opens a session whose events go to an observer."""
@@ -183,7 +185,21 @@ class QueueRun:
         # an interrupted run holds shots already: its entry comes before all others
         return next(iter([*interrupted, *waiting]), None)
 
+    def _await_room(self, entry: Entry) -> None:
+        """Wait while the disk is full: what fills it may go away, and the rest of the night be taken."""
+        folder = entry.options.output or self.queue.folder
+        is_said = False
+        while free_bytes(folder) < ROOM_BYTES and not self.queue.is_asked_to_stop:
+            if not is_said:
+                what = f"waits: the disk of {visible(str(folder))} has {size_text(free_bytes(folder))} free"
+                say(f"queue: {what}, and goes on at {size_text(ROOM_BYTES)}", stream=sys.stderr)
+            is_said = True
+            time.sleep(POLL_S)
+
     def _work(self, entry: Entry) -> None:
+        self._await_room(entry)
+        if self.queue.is_asked_to_stop:
+            return
         # an entry that fails is not taken again by this process, unless it says so
         self._tried.add(entry.id)
         self.begin(entry)
@@ -220,6 +236,9 @@ class QueueRun:
             if entry.rules.if_fails == "stop" and not self.keep_going:
                 raise error
         self.fail(error)
+        self._await_room(entry)
+        with suppress(RecordingError):  # a full disk could not take it before
+            recorder.write()
 
     def _take_calibrations(self, entry: Entry) -> None:
         """Take the calibrations again that the entry needs and that are missing, too old or doubted."""

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import math
 import shlex
-import shutil
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -22,6 +20,7 @@ from labseq.assembly.plugin_choice import changed_settings
 from labseq.assembly.point import Point
 from labseq.assembly.wiring import unsuitable_exposures
 from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, ProblemCollector, one_of
+from labseq.files import free_bytes
 from labseq.guard import Guard
 from labseq.messages import visible
 from labseq.model import COMPUTER, Frame, LineSpec, Plan, TimelineEntry
@@ -398,8 +397,8 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         guard.end()
     rehearsals, bars = first.rehearsed, [bar for _, of_step in first.timeline for bar in of_step]
     warnings += _judgement_warnings(assembly, [*rehearsals])
-    shot_bytes, free_bytes = _shot_bytes(assembly, first.lab, bars), _free_bytes(run.root)
-    warnings += _disk_warnings(run, shot_bytes or 0, free_bytes)
+    shot_bytes, free = _shot_bytes(assembly, first.lab, bars), free_bytes(run.root)
+    warnings += _disk_warnings(run, shot_bytes or 0, free)
     notes = [Problem(text) for text in (*assembly.warnings, *assembly.hardware.host.notes)]
     return CheckReport(
         first.timeline,
@@ -409,7 +408,7 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         (*notes, *warnings, *_light_warnings(assembly, first.lab)),
         next(iter(rehearsals.values()), None),
         shot_bytes,
-        free_bytes,
+        free,
         first.lab.line_specs,
         {name: text for name, device in first.lab.hardware() if (text := device.idle_output)},
     )
@@ -625,11 +624,6 @@ def _shot_bytes(assembly: Assembly, lab: Lab, bars: Sequence[TimelineEntry]) -> 
         return None
     per_image = BYTES_PER_SITE * lab.grid.n_rows * lab.grid.n_cols
     return SHOT_OVERHEAD_BYTES + n_images * per_image + kept * 2 * math.prod(shape or (0,))
-
-
-def _free_bytes(folder: Path) -> int:
-    """Free space of the disk on which a folder is, or will be."""
-    return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
 
 
 def _disk_warnings(run: PreparedRun, shot_bytes: int, free_bytes: int) -> Iterator[Problem]:

@@ -6,7 +6,6 @@ shot, and so that it is sent even if this process ends meanwhile.
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 import time
@@ -17,16 +16,20 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Field, StringConstraints
 
 from labseq.config.document import Document
-from labseq.files import data_root
+from labseq.files import data_root, free_bytes
 from labseq.messages import visible
 from labseq.plain import dumps
 from labseq.recording.folders import NOTIFY_FILE
 from labseq.settings import Settings
+from labseq.units import size_text
 
 NOTIFY_LOG: Final = "notify.log"
 """Notices that could not be sent."""
 LOOK_S: Final = 60.0
 """Time between two looks at the free space of the disk, in seconds."""
+
+FREE_GB: Final = 5.0
+"""A disk with fewer GB free is nearly full, unless ``notify.yaml`` says otherwise."""
 
 NoticeKind = Literal["failed", "alarm", "disk", "queue"]
 
@@ -45,7 +48,19 @@ class NoticeSettings(Settings):
         default=("failed", "alarm", "disk", "queue"),
         description="a run has failed, an alarm has begun, the disk is nearly full, the queue has ended",
     )
-    free_gb: float = Field(default=5.0, gt=0, description="'disk': fewer GB than this are free")
+    free_gb: float = Field(
+        default=FREE_GB, gt=0, description="fewer GB than this are free: 'disk', and an alarm of the page"
+    )
+
+    @classmethod
+    def read(cls, root: Path) -> Self | None:
+        """The settings in a data folder; None without a file.
+
+        Raises:
+            ConfigError: The file has an error.
+        """
+        path = root / NOTIFY_FILE
+        return Document.read(path).validate(cls) if path.is_file() else None
 
     def task(self, kind: str, run: str, text: str) -> dict[str, Any]:
         """What :func:`labseq.session.send_notice.send` is to do."""
@@ -78,8 +93,7 @@ class Notices:
             ConfigError: The file has an error.
         """
         root = data_root().absolute()
-        path = root / NOTIFY_FILE
-        return cls(Document.read(path).validate(NoticeSettings) if path.is_file() else None, root)
+        return cls(NoticeSettings.read(root), root)
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         """Send a notice if the event is one that is wanted."""
@@ -101,10 +115,10 @@ class Notices:
         if time.monotonic() < self._next_look_s:
             return
         self._next_look_s = time.monotonic() + LOOK_S
-        free = shutil.disk_usage(self._run_dir).free
+        free = free_bytes(self._run_dir)
         if free < free_gb * 1e9:
             self._next_look_s = float("inf")  # once in a run
-            self.send("disk", f"{free / 1e9:.2g} GB are free on the disk of {visible(str(self._run_dir))}")
+            self.send("disk", f"{size_text(free)} are free on the disk of {visible(str(self._run_dir))}")
 
     def send(self, kind: NoticeKind, text: str) -> None:
         """Send a notice, if its kind is wanted."""

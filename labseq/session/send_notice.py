@@ -10,6 +10,7 @@ import urllib.request
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 from labseq.plain import now_utc
 
@@ -24,17 +25,19 @@ def send(task: Mapping[str, Any]) -> list[str]:
         Why a way failed, for each one that did.
     """
     command, webhook, notice = task["command"], task["webhook"], task["notice"]
-    ways: list[Callable[[], object]] = []
+    ways: dict[str, Callable[[], object]] = {}
     if command:
-        ways.append(lambda: _run([*command, notice["text"]]))
-    if webhook:
-        ways.append(lambda: _post(webhook, notice))
+        ways[command[0]] = lambda: _run([*command, notice["text"]])
+    if webhook:  # the rest of an address may hold a secret
+        ways[urlsplit(webhook).hostname or "webhook"] = lambda: _post(webhook, notice)
     failures: list[str] = []
-    for way in ways:
+    for name, way in ways.items():
         try:
             way()
+        except TimeoutError:
+            failures.append(f"{name} did not answer within {MAX_S:g} s")
         except (OSError, ValueError, http.client.HTTPException, subprocess.SubprocessError) as error:
-            failures.append(f"{type(error).__name__}: {error}")
+            failures.append(f"{name}: {type(error).__name__}: {error}")
     return failures
 
 
@@ -55,7 +58,8 @@ def main() -> None:
     if failures := send(task):
         with Path(task["log"]).open("a", encoding="utf-8") as log:
             log.writelines(
-                f"{now_utc('seconds')} {task['notice']['text']}: {failure}\n" for failure in failures
+                f"{now_utc('seconds')} {failure}; not sent: {task['notice']['text']}\n"
+                for failure in failures
             )
 
 

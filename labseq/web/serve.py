@@ -58,11 +58,13 @@ def serve(data: Path | None, serving: Serving) -> None:
     """Serve the pages of a data folder until Ctrl-C.
 
     Raises:
-        ConfigError: The package is missing, the folder or a certificate does not exist, or the port is taken.
+        ConfigError: The package is missing, the folder or a certificate does not exist, the port is taken,
+            or notify.yaml has an error.
     """
     check_packages()
     import uvicorn
 
+    from labseq.session.notices import FREE_GB, NoticeSettings
     from labseq.web.app import make_app
     from labseq.web.state import Limits
 
@@ -72,12 +74,12 @@ def serve(data: Path | None, serving: Serving) -> None:
     for path in (serving.certificate, serving.key):
         if path is not None and not path.is_file():
             raise ConfigError(Problem("there is no such file", visible(str(path)), expected="a PEM file"))
+    notices = NoticeSettings.read(root)
+    limits = Limits(serving.calibration_age_s, FREE_GB if notices is None else notices.free_gb)
     is_open = is_loopback(serving.host) and not serving.names
     token = "" if is_open and not serving.control else find_token()
     listener = _listener(serving.host, serving.port)
-    app = make_app(
-        root, Access(token, server_names(serving.names), serving.control), Limits(serving.calibration_age_s)
-    )
+    app = make_app(root, Access(token, server_names(serving.names), serving.control), limits)
     for line in _greeting(root, serving, listener.getsockname()[1], token):
         say(line)
     config = uvicorn.Config(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import time
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -16,15 +15,17 @@ from typing import Any, Final, cast
 from labseq.analysis.timing import StageTotals
 from labseq.calibration_store import read_entry
 from labseq.console.events import event_text, point_of_shot
-from labseq.console.text import age_text, percent, plural
+from labseq.console.text import age_text, plural
 from labseq.data import Shot
 from labseq.data.follower import Event
 from labseq.errors import ConfigError, LabseqError, RecordingError
+from labseq.files import free_bytes
 from labseq.model import StageTiming
 from labseq.model.records import OVERSHOOT_S, STEP
 from labseq.plain import now
 from labseq.recording.folders import INDEX_FILE, STOP_FILE
 from labseq.recording.run_file import read_state
+from labseq.session.notices import FREE_GB
 from labseq.units import size_text
 from labseq.web.history import Columns, judged_values
 from labseq.web.runs import OpenRun, notes_of, profile_of, text_of
@@ -44,11 +45,11 @@ class Limits:
 
     Attributes:
         calibration_s: Greatest age of a calibration in use, in seconds.
-        free_share: Least share of the disk that is free.
+        free_gb: The disk is nearly full if it has fewer GB free.
     """
 
     calibration_s: float = 7 * 86_400.0
-    free_share: float = 0.05
+    free_gb: float = FREE_GB
 
 
 class RunState:
@@ -191,7 +192,7 @@ class RunState:
             *_run_alarms(self.run, status, error, columns),
             *self._budget_alarms(),
             *calibration_alarms(self.run.folder, record, self._limits.calibration_s),
-            *disk_alarms(self.run.folder, self._limits.free_share),
+            *disk_alarms(self.run.folder, self._limits.free_gb),
         ]
         if self._shot_error:
             alarms.append(alarm("warning", "The last shot cannot be read", self._shot_error))
@@ -348,16 +349,16 @@ def calibration_alarms(folder: Path, record: Mapping[str, Any], limit_s: float) 
     return alarms
 
 
-def disk_alarms(folder: Path, free_share: float) -> list[dict[str, str]]:
+def disk_alarms(folder: Path, free_gb: float) -> list[dict[str, str]]:
     """An alarm if the disk is nearly full."""
     try:
-        disk = shutil.disk_usage(folder)
+        free = free_bytes(folder)
     except OSError:
         return []
-    if disk.free >= max(2e9, free_share * disk.total):
+    if free >= free_gb * 1e9:
         return []
-    free = f"{size_text(disk.free)} of {size_text(disk.total)} free ({percent(disk.free / disk.total)})"
-    return [alarm("warning" if disk.free else "error", "The disk is nearly full", free)]
+    text = f"{size_text(free)} are free, fewer than {free_gb:g} GB"
+    return [alarm("warning" if free else "error", "The disk is nearly full", text)]
 
 
 def log_line(event: Event) -> dict[str, str]:

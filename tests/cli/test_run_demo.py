@@ -39,7 +39,7 @@ def suggested(out: str) -> list[list[str]]:
 def test_first_look(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("hardware_profiles").mkdir()
     Path("hardware_profiles/virtual.yaml").write_text("a profile of this lab, which must not be used")
-    assert run("demo", "--shots", "1") == 0
+    assert run("demo", "--shots", "1e0") == 0
     out = capsys.readouterr().out
     (run_dir,) = here.glob("data/*/*")
     assert labseq.open_run(run_dir).record["name"] == "compact-225"

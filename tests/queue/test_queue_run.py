@@ -18,7 +18,7 @@ from labseq.errors import ConfigError, RecordingError, StopRequested
 from labseq.model import CalibrationEntry, SiteGrid, grid_facts
 from labseq.plain import now_utc
 from labseq.processes import Process
-from labseq.queue.queue import Queue, Rules
+from labseq.queue.queue import Entry, Queue, Rules
 from labseq.queue.running import Opening, QueueRun
 from labseq.session.session import Session
 from labseq.session.stopping import ask_to_stop
@@ -259,6 +259,35 @@ def test_a_run_that_fails_twice_is_left_and_the_queue_goes_on(queue: Queue) -> N
     taking.run(queue)
     assert taking.begun == [1, 1, 2]
     assert states(queue) == {1: "failed"}
+
+
+def test_a_full_disk_holds_the_queue_until_there_is_room(
+    queue: Queue, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add(queue, rules=Rules("skip"))
+    add(queue)
+    looks, write = [0], Queue.write
+
+    def fill(run_dir: Path) -> None:
+        lose_folder(run_dir)
+        looks[0] = 5
+
+    def free(_: Path) -> int:
+        looks[0] = max(0, looks[0] - 1)
+        return 0 if looks[0] else 10**12
+
+    def write_if_room(queue: Queue, entry: Entry) -> None:
+        if looks[0]:
+            raise RecordingError(queue.folder, "cannot be written: No space left on device")
+        write(queue, entry)
+
+    monkeypatch.setattr(Queue, "write", write_if_room)
+    monkeypatch.setattr("labseq.queue.running.free_bytes", free)
+    monkeypatch.setattr("labseq.queue.running.POLL_S", 0.0)
+    taking = Taking(fill)
+    taking.run(queue)
+    assert (taking.begun, states(queue)) == ([1, 2], {1: "failed"})
+    assert capsys.readouterr().err.count("queue: waits: the disk of") == 1
 
 
 def test_no_shot_is_taken_after_the_time_of_an_entry(queue: Queue) -> None:

@@ -56,9 +56,10 @@ def test_every_way_is_tried_and_each_failure_is_named(
     assert (told.read_text(), received) == (notice["text"], [notice])
     Receiver.status = 500
     failures = send({"command": ["no-such-program"], "webhook": address, "notice": notice})
-    assert [failure.partition(":")[0] for failure in failures] == ["FileNotFoundError", "HTTPError"]
+    named = [failure.split(": ")[:2] for failure in failures]
+    assert named == [["no-such-program", "FileNotFoundError"], ["127.0.0.1", "HTTPError"]]
     misspelt = send({"command": [], "webhook": "http://localhost:80x/", "notice": notice})
-    assert misspelt == ["InvalidURL: nonnumeric port: '80x'"]
+    assert misspelt == ["localhost: InvalidURL: nonnumeric port: '80x'"]
 
 
 class Sent(list[dict[str, str]]):

@@ -7,7 +7,6 @@ import os
 import shutil
 from datetime import timedelta
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -254,7 +253,7 @@ def test_a_clock_that_jumped_and_a_full_disk(run_dir: Path, monkeypatch: Any) ->
     record = json.loads((run_dir / "run.json").read_text())
     record["t_start_utc"] = "9999-12-31T23:59:59+14:00"
     (run_dir / "run.json").write_text(json.dumps(record))
-    disk = SimpleNamespace(total=10**12, used=10**12, free=0)
-    monkeypatch.setattr("labseq.web.state.shutil.disk_usage", lambda _: disk)
-    state = answers(client_of(run_dir.parent.parent), "/api/v1/now")
-    assert "The disk is nearly full" in [alarm["title"] for alarm in state["alarms"]]
+    for free, is_alarmed in ((4_900_000_000, True), (5_100_000_000, False)):
+        monkeypatch.setattr("labseq.web.state.free_bytes", lambda _, free=free: free)
+        state = answers(client_of(run_dir.parent.parent), "/api/v1/now")
+        assert ("The disk is nearly full" in [one["title"] for one in state["alarms"]]) == is_alarmed
