@@ -40,7 +40,13 @@ def examine(data: Path | None, *, dry_run: bool, as_json: bool) -> int:
         root = folder_of_run(data)
     report = find_damage(root, dry_run=dry_run)
     examined = Examination(
-        root, dry_run, report.n_runs, report.n_shots, tuple(report.in_progress), tuple(report.findings)
+        root,
+        dry_run,
+        report.n_runs,
+        report.n_shots,
+        tuple(report.in_progress),
+        report.n_in_use,
+        tuple(report.findings),
     )
     print_report(examined, as_json=as_json)
     return RecordingError.exit_code if examined.n_left else 0
@@ -56,6 +62,7 @@ class Examination:
         runs: Number of runs that were checked.
         shots: Number of their intact shots.
         in_progress: Runs that are in progress, and were not checked.
+        in_use: Number of the intact shots that another program has open for writing.
         findings: The defects.
     """
 
@@ -64,6 +71,7 @@ class Examination:
     runs: int
     shots: int
     in_progress: tuple[Path, ...]
+    in_use: int
     findings: tuple[Finding, ...]
 
     @property
@@ -76,6 +84,8 @@ class Examination:
         lines = [f"{plural(self.runs, 'run')} checked, {plural(self.shots, 'shot')} intact"]
         if self.in_progress:
             lines.append(f"{plural(len(self.in_progress), 'run')} in progress not checked")
+        if self.in_use:
+            lines.append(f"{plural(self.in_use, 'shot')} of these open for writing in another program")
         n_findings = len(self.findings)
         if not n_findings:
             return [*lines, "no damage found"]

@@ -187,7 +187,7 @@ class QueueRun:
 
     def _await_room(self, entry: Entry) -> None:
         """Wait while the disk is full: what fills it may go away, and the rest of the night be taken."""
-        folder = entry.options.output or self.queue.folder
+        folder = entry.options.output or self.queue.folder.parent
         is_said = False
         while free_bytes(folder) < ROOM_BYTES and not self.queue.is_asked_to_stop:
             if not is_said:

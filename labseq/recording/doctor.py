@@ -72,12 +72,14 @@ class Report:
         n_runs: Runs that were checked.
         n_shots: Number of their intact shots.
         in_progress: Runs that were left alone because they are in progress, here or on another computer.
+        n_in_use: Number of the intact shots that another program has open for writing.
     """
 
     findings: list[Finding] = field(default_factory=list[Finding])
     n_runs: int = 0
     n_shots: int = 0
     in_progress: list[Path] = field(default_factory=list[Path])
+    n_in_use: int = 0
 
 
 def examine(path: Path, *, dry_run: bool = False) -> Report:
@@ -132,6 +134,7 @@ def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
     report.findings += check.findings
     report.n_runs += 1
     report.n_shots += check.n_whole
+    report.n_in_use += check.n_in_use
 
 
 def _is_in_progress(run_dir: Path) -> bool:
@@ -212,12 +215,14 @@ class _Check:
         folder: The folder; files that do not belong are moved to its quarantine.
         findings: In the order they were found.
         n_whole: Number of intact shots.
+        n_in_use: Number of those that another program has open for writing.
     """
 
     def __init__(self, folder: Path, *, dry_run: bool) -> None:
         self.folder = folder
         self.findings: list[Finding] = []
         self.n_whole = 0
+        self.n_in_use = 0
         self._dry_run = dry_run
 
     def check_run(self) -> None:
@@ -354,10 +359,13 @@ class _Check:
             return False
         good = [number for number, row in rows.items() if row.sha256 == sha256]
         if is_marked and (good or _is_locked(path)):
-            what, then = "another program has it open for writing", "left as it is: nothing has changed"
-            if not good:
-                what, then = f"{what} and has changed it", "left: close it there, then run this again"
-            self.findings.append(Finding(what, path, then, left=not good))
+            if good:
+                self.n_in_use += 1
+            else:
+                what = "another program has it open for writing and has changed it"
+                self.findings.append(
+                    Finding(what, path, "left: close it there, then run this again", left=True)
+                )
         elif not good:
             what = "the checksum does not hold: a byte has changed since it was written"
             if n_bytes < last.bytes:
