@@ -12,8 +12,9 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
+from urllib.parse import urlsplit
 
-from pydantic import Field, StringConstraints
+from pydantic import Field, StringConstraints, field_validator
 
 from labseq.config.document import Document
 from labseq.files import data_root, free_bytes
@@ -51,6 +52,12 @@ class NoticeSettings(Settings):
     free_gb: float = Field(
         default=FREE_GB, gt=0, description="fewer GB than this are free: 'disk', and an alarm of the page"
     )
+
+    @field_validator("webhook")
+    @classmethod
+    def _is_address(cls, webhook: str) -> str:
+        urlsplit(webhook).port  # raises ValueError if the host or the port cannot be read  # noqa: B018
+        return webhook
 
     @classmethod
     def read(cls, root: Path) -> Self | None:

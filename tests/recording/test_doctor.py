@@ -163,7 +163,7 @@ def test_two_files_of_a_name_are_both_kept(run_dir: Path) -> None:
 
 def test_an_earlier_take_of_a_shot_does_not_replace_the_later(run_dir: Path) -> None:
     lost_line(run_dir)
-    writer = RunWriter.reopen(run_dir, make_run(), n_written=3)
+    writer = RunWriter.reopen(run_dir, make_run(n_shots=N_SHOTS), n_written=3)
     later = run_dir / writer.write_shot(make_shot(1, success=False)).file
     writer.finish("complete")
     assert later.name == "shot_000001.take_2.h5"
