@@ -32,11 +32,12 @@ def watch_run(
     Args:
         follow: Whether to wait for the next run in the data folder then, and show that, until Ctrl-C.
     """
-    run_dir, shown = folder_of_run(path), stream or sys.stdout
+    # resolved, to be compared with other runs: the data folder may be relative, or a link
+    run_dir, shown = folder_of_run(path).resolve(), stream or sys.stdout
     try:
         _watch_one(run_dir, shown, wait)
         while follow:
-            while (newest := newest_run(data_root())) == run_dir:
+            while (newest := newest_run(data_root()).resolve()) == run_dir:
                 wait(0.5)
             _watch_one(run_dir := newest, shown, wait)
     except KeyboardInterrupt:

@@ -129,10 +129,12 @@ def test_lines_of_another_version_and_damaged_ones_are_passed_over(watched: Writ
     assert any(line.startswith("shot 0  ") for line in watched.watch())
 
 
+@pytest.mark.parametrize("is_named", [True, False])
 def test_the_next_run_is_watched_when_one_is_over(
-    watched: WrittenRun, tmp_path: Path, fake: Any, monkeypatch: pytest.MonkeyPatch
+    watched: WrittenRun, tmp_path: Path, fake: Any, monkeypatch: pytest.MonkeyPatch, is_named: bool
 ) -> None:
-    monkeypatch.setenv("LABSEQ_DATA", str(tmp_path))
+    monkeypatch.chdir(tmp_path.parent)
+    monkeypatch.setenv("LABSEQ_DATA", tmp_path.name)
     runs = [watched]
 
     def begin_another() -> None:
@@ -147,8 +149,10 @@ def test_the_next_run_is_watched_when_one_is_over(
         lambda: runs[1].writer.finish("failed", "no light"),
         leave,
     ]
-    watch_run(watched.writer.run_dir, watched.out, lambda _: steps.pop(0)(), follow=True)
+    named = watched.writer.run_dir if is_named else None
+    watch_run(named, watched.out, lambda _: steps.pop(0)(), follow=True)
     text = watched.out.getvalue()
-    assert all(str(run.writer.run_dir) in text for run in runs)
+    summaries = [line for line in text.splitlines() if line.startswith("run ")]
+    assert [line.split()[1] for line in summaries] == [str(run.writer.run_dir) for run in runs]
     assert "no light" in text
     assert text.splitlines()[-1].startswith("no longer watched")
