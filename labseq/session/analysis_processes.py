@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from labseq.data import Run, open_run
 from labseq.errors import DeviceError, LabseqError
-from labseq.files import check_ordinary, make_folder
+from labseq.files import check_ordinary, make_folder, share_with_group
 from labseq.guard import StopFlag
 from labseq.messages import clean, did_you_mean, listing
 from labseq.recording.folders import RESULT_PREFIX
@@ -217,6 +217,7 @@ class _AnalysisProcess:
             check_ordinary(self._log)
         with self._log.open("ab") as log:
             self._seen = log.tell()
+            share_with_group(self._log)  # another user may resume the run
             self._process = subprocess.Popen(  # noqa: S603 - our own module, no shell
                 [sys.executable, "-P", "-m", _MODULE, str(run_dir), name, str(self._finish_within_s)],
                 stdin=subprocess.PIPE,

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
+from labseq.files import share_with_group
 from labseq.plain import now_utc
 
 MAX_S: Final = 20.0
@@ -57,6 +58,7 @@ def main() -> None:
     task = json.load(sys.stdin)
     if failures := send(task):
         with Path(task["log"]).open("a", encoding="utf-8") as log:
+            share_with_group(Path(task["log"]))
             log.writelines(
                 f"{now_utc('seconds')} {failure}; not sent: {task['notice']['text']}\n"
                 for failure in failures
