@@ -54,12 +54,10 @@ def named_run(name: str, root: Path) -> Path:
         RecordingError: There is none.
     """
     day, _, last = name.rpartition("/")
-    for folder in reversed(runs_in(root)):
-        is_number = last.isdecimal() and int(last) == counter_of(folder.name)
-        if day in ("", folder.parent.name) and (
-            is_number or last in (folder.name, folder.name.partition("_")[2])
-        ):
-            return folder
+    for its_day, its_name in newest_first(root):
+        is_number = last.isdecimal() and int(last) == counter_of(its_name)
+        if day in ("", its_day) and (is_number or last in (its_name, its_name.partition("_")[2])):
+            return root / its_day / its_name
     what = f"no such file or folder, and no run of this name or number in {visible(str(root))}"
     raise RecordingError(name, what, "`labseq runs` lists the runs")
 
@@ -70,10 +68,10 @@ def newest_run(root: Path) -> Path:
     Raises:
         RecordingError: There is none.
     """
-    folders = [folder for folder in runs_in(root) if (folder / RUN_FILE).exists()]
-    if not folders:
-        raise RecordingError(root, "holds no runs", "give a run's folder, or set LABSEQ_DATA")
-    return folders[-1]
+    for day, name in newest_first(root):
+        if (root / day / name / RUN_FILE).exists():
+            return root / day / name
+    raise RecordingError(root, "holds no runs", "give a run's folder, or set LABSEQ_DATA")
 
 
 def not_a_run(path: Path) -> RecordingError:
