@@ -208,7 +208,9 @@ class Lock:
             return self.holder() or Holder()
         except (NotImplementedError, OSError) as error:
             failure = error if isinstance(error, OSError) else OSError(errno.ENOSYS, str(error))
-            if warn is None or not _knows_no_locks(failure):
+            # the codes of a folder, perhaps on a network, that does not support locks
+            no_locks = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP}
+            if warn is None or failure.errno not in no_locks:
                 raise failure from error
             warn(f"{self.path.parent} does not support file locks: another process could work there, too")
             return None
@@ -248,11 +250,6 @@ class Lock:
             return Holder(str(values["what"]), Process.from_plain(values), str(values["since_utc"]), silent_s)
         except (RecordingError, OSError, KeyError):
             return None
-
-
-def _knows_no_locks(error: OSError) -> bool:
-    """Whether a lock failed because its folder, perhaps on a network, does not support locks."""
-    return error.errno in {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP}
 
 
 def _local(time_utc: str) -> str:

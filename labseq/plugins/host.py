@@ -426,7 +426,8 @@ class PluginHost:
         if any(file and Path(file).resolve() == resolved for file in files):
             return False
         # what Python imports from this folder anyway is a library beside the plugins, unless it states that
-        return module_location(plugin_name(path)) != plugin_location(path) or _states_api(path)
+        is_library = module_location(plugin_name(path)) == plugin_location(path)
+        return not is_library or b"LABSEQ_API" in path.read_bytes()
 
     def get(self, kind: str, name: str, file: Path | None = None) -> Entry:
         """Find the registry entry of a name in a sequence or profile.
@@ -470,10 +471,6 @@ class PluginHost:
             )
             for implementation in getattr(self._pluggy.hook, hook).get_hookimpls()
         ]
-
-
-def _states_api(path: Path) -> bool:
-    return b"LABSEQ_API" in path.read_bytes()
 
 
 def name_and_version(distribution: importlib.metadata.Distribution) -> tuple[str, str]:

@@ -122,16 +122,6 @@ def open_devices(
             guard.call(name, longest_s + DRIVER_MARGIN_S, device.settle)
 
 
-def close_devices(lab: Lab, guard: Guard, names: Collection[str]) -> None:
-    """Make the devices of these names safe, all of them first, then close them.
-
-    Raises:
-        LabseqError: One of them fails.
-    """
-    _raise_first(make_safe(lab, guard, names))
-    _raise_first(close_all(lab, guard, names))
-
-
 def _raise_first(outcome: Outcome) -> None:
     for failure in filter(None, outcome.values()):
         raise failure
@@ -256,7 +246,8 @@ class Sequencer:
         """
         if reopened:
             self._states.to(State.REOPENING)
-            close_devices(self.lab, self.guard, reopened)
+            _raise_first(make_safe(self.lab, self.guard, reopened))  # all of them before any is closed
+            _raise_first(close_all(self.lab, self.guard, reopened))
             self._watchdog.forget(reopened)
         self.lab, self._steps, self._parameters = lab, steps, dict(parameters)
         self.guard.direct = lab.direct_calls
