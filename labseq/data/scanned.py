@@ -151,11 +151,19 @@ def _numbers(values: Sequence[Any], written: Sequence[str]) -> tuple[tuple[float
 
 
 def is_geometric(values: Sequence[float]) -> bool:
-    """Whether rising values have nearly equal ratios, over a wide range."""
+    """Whether rising values have nearly equal ratios over a wide range, or most are crowded at its beginning.
+
+    Example:
+        >>> is_geometric([1, 2, 5, 10, 20]), is_geometric([1, 10, 20, 30, 40])
+        (True, False)
+        >>> is_geometric([10, 15, 20, 30, 45, 100, 300, 1000, 3000])  # on a linear axis most would be at 0
+        True
+    """
     if len(values) < 3 or values[0] <= 0 or values[-1] < 20 * values[0]:
         return False
     steps = np.diff(np.log(values))
-    return float(np.ptp(steps)) <= 0.5 * float(steps.mean())  # "1, 2, 5, 10" passes
+    is_even = float(np.ptp(steps)) <= 0.5 * float(steps.mean())  # "1, 2, 5, 10" passes
+    return is_even or values[len(values) // 2] <= values[0] + (values[-1] - values[0]) / 20
 
 
 @dataclass(frozen=True, slots=True)

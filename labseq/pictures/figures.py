@@ -68,8 +68,14 @@ def show_plain_numbers(axis: Axis) -> None:
     """Label a logarithmic axis with as many plain numbers as fit, instead of powers of ten."""
     from matplotlib.ticker import LogFormatter
 
-    axis.set_major_formatter(LogFormatter())
-    axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+    class PlainFormatter(LogFormatter):
+        """Matplotlib's choice of ticks, with 0.01 where it writes 1e-02."""
+
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            return f"{x:g}" if super().__call__(x, pos) else ""
+
+    axis.set_major_formatter(PlainFormatter())
+    axis.set_minor_formatter(PlainFormatter(minor_thresholds=(2, 0.5)))
 
 
 def encode_figure(draw: Callable[[], Figure], kind: str = ".png", **options: Any) -> bytes:

@@ -31,6 +31,7 @@ from labseq.pictures.figures import (
     place_sites,
     plan_timelines,
     save_figure,
+    show_plain_numbers,
 )
 from labseq.testing.strategies import grids
 
@@ -163,3 +164,10 @@ def test_borders_are_closed(sites: NDArray[np.bool_], grid_and_n: tuple[SiteGrid
     assert (len(stretches) == n) == (sites.sum() == 1)
     ends = Counter((round(x, 6), round(y, 6)) for x, y in stretches.reshape(-1, 2).tolist())
     assert all(count % 2 == 0 for count in ends.values())
+
+
+def test_a_logarithmic_axis_has_plain_numbers_below_one() -> None:
+    axes = make_figure(4, 3).subplots()
+    axes.set(xscale="log", xlim=(0.01, 3))
+    show_plain_numbers(axes.xaxis)
+    assert {"0.01", "0.1", "1"} <= {label.get_text() for label in axes.get_xticklabels()}

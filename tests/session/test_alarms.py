@@ -238,6 +238,7 @@ class Broken:
         ("clock", []),
         ("full", ["profile.simulation.loading=100%"]),
         ("confidence", ["profile.detector.width=1000", "shots=40"]),
+        ("confidence", ["profile.simulation.image.em_gain=200", "shots=40"]),
     ],
 )
 def test_a_run_that_breaks_gives_its_alarm_and_no_other(

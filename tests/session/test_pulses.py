@@ -118,3 +118,15 @@ def test_a_fit_finds_what_the_virtual_lab_was_given(
     for parameter, given, error in (("frequency", frequency_hz, 0.02), ("decay", decay_s, 0.3)):
         assert abs(found[parameter].value - given) < 3 * found[parameter].error, parameter
         assert found[parameter].error < error * given
+
+
+def test_an_echo_finds_the_coherence_time_of_atoms_whose_detunings_differ(tmp_path: Path) -> None:
+    text = (ROOT / "sequences" / "spin_echo.yaml").read_text("utf-8")
+    (tmp_path / "s.yaml").write_text(
+        re.sub(r"range: \[.*?\]", "range: [40 us, 800 us, 40 us]", text), "utf-8"
+    )
+    physics = "{relaxation_time: 2 ms, coherence_time: 0.2 ms, detuning_spread: 2 kHz}"
+    overrides = [f"profile.simulation.qubit={physics}", *SMALL_FRAMES]
+    taken = run(tmp_path, tmp_path / "s.yaml", seed=1, overrides=overrides)
+    decay = taken.fit("survival:before,after", "exponential", free=["offset"]).parameters["decay"]
+    assert abs(decay.value - 0.2e-3) < 2 * decay.error < 0.1e-3
