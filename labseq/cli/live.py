@@ -413,6 +413,9 @@ def _results(tally: Tally) -> Table:
         table.add_row("best so far", Text(tally.best))
     if tally.n_repeated:
         table.add_row("repeated", Text(plural(tally.n_repeated, "attempt"), "yellow"))
+    # a value that is too long is cut, never its name
+    names = table.columns[0]
+    names.min_width = max((len(str(name)) for name in names.cells), default=0)
     return table
 
 

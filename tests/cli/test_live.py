@@ -184,6 +184,10 @@ def test_80_columns_cut_no_head_and_no_number(fake: Any) -> None:
     assert "stage host p99 modelled budget over\n" in text
     assert "read_out 12.9 ms 12.9 ms 43.1 ms 2.89 ms 1000\n" in text
     assert text.count("after 3 cycles)") == 2
+    tally.best = "0.98578, point 2 (15, 242.5 um/ms, another value)"
+    text = "\n".join(picture(tally, 80, 24))
+    assert "seen defect-free  2 of 2" in text
+    assert "best so far       0.98578, point 2" in text
 
 
 def test_a_wide_terminal_shows_everything(fake: Any) -> None:
