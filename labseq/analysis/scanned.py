@@ -201,13 +201,34 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
     if fit is not None:
         # without a name, that of the first: a model suits one quantity, and not those beside it
         wanted = quantities if request.names else quantities[:1]
-        fits = tuple(
-            fits_along(run, scan, quantity, means, fit) if quantity in wanted else []
-            for quantity, means in values
-        )
+        fits = _fits_of(run, scan, [one for one in values if one[0] in wanted], fit)
+        fits += ([],) * (len(values) - len(wanted))
     elif not request.names:
         fits = tuple(own_fits(run, scan, quantity, means) for quantity, means in values)
     return ScanReport(scan, values, fits)
+
+
+def _fits_of(
+    run: Run, scan: Scanned, values: Sequence[tuple[Quantity, list[Estimated]]], request: FitRequest
+) -> tuple[list[FitAt], ...]:
+    """The fits of each quantity; of several, one that fails does not hide the others.
+
+    Raises:
+        ConfigError: None can be fitted.
+    """
+    fits: list[list[FitAt]] = []
+    errors: list[ConfigError] = []
+    for quantity, means in values:
+        try:
+            fits.append(fits_along(run, scan, quantity, means, request))
+        except ConfigError as error:
+            errors.append(error)
+            problem = "; ".join(problem.what for problem in error.problems)
+            failed = f"no fit {clean(request.model)} of {title_of(quantity)}: {problem}"
+            fits.append([FitAt({}, {}, None, failed)])
+    if len(errors) == len(values):
+        raise errors[0]
+    return tuple(fits)
 
 
 def results_of(run: Run, report: ScanReport) -> list[tuple[str, str]]:

@@ -45,6 +45,15 @@ def test_the_first_value_is_fitted_at_each_of_the_second(two: labseq.Run) -> Non
     assert titles[-2:] == ["amplitude of the exponential fits", "decay of the exponential fits"]
 
 
+def test_of_several_quantities_one_that_cannot_be_fitted_is_named_beside_the_others(two: labseq.Run) -> None:
+    report = scan_report(two, ScanRequest((SURVIVAL, "n_images"), FitRequest("exponential", {})))
+    assert [at.fit is not None for fits in report.fits for at in fits] == [True, True, False]
+    last = report.as_text()[-1]
+    assert last == "no fit exponential of n_images: the quantity is the same at all points"
+    with pytest.raises(ConfigError, match="the same at all points"):
+        scan_report(two, ScanRequest(("n_images",), FitRequest("exponential", {})))
+
+
 def picture_rows(run: labseq.Run) -> Any:
     picture = scan_picture(run, ScanRequest((SURVIVAL,), FitRequest("exponential", {})))
     picture.draw()
