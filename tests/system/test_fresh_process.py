@@ -12,6 +12,7 @@ import labseq
 from tests.measure_structure import count_lines, virtual_run
 
 pytestmark = pytest.mark.system
+ROOT = Path(__file__).parents[2]
 
 
 def printed(code: str, *arguments: str, cwd: Path) -> str:
@@ -81,6 +82,27 @@ print(*sorted(sys.modules))
     modules = printed(code, cwd=tmp_path).splitlines()[-1].split()
     assert "sqlite3" in modules
     assert not {"h5py", "labseq.model", "numpy"} & {*modules}
+
+
+def test_a_fit_imports_only_what_it_needs(tmp_path: Path) -> None:
+    """So that `show --fit` of what a run measures takes no longer than `show`."""
+    changes = ["scan={shot.hold.duration: [1 s, 10 s, 40 s]}", "repeats=1"]
+    sequence = ROOT / "sequences" / "lifetime.yaml"
+    with labseq.Session.open(sequence, overrides=changes, seed=1, output=tmp_path) as session:
+        folder = session.run().path
+    code = f"""
+import sys
+from labseq.cli import main
+sys.argv = ["labseq", "show", {str(folder)!r}, "--scan", "survival:before,after", "--fit", "exponential"]
+try:
+    main()
+except SystemExit:
+    pass
+print(sorted({{"h5py", "lmfit", "matplotlib", "numba", "pandas", "rich"}} & {{*sys.modules}}))
+"""
+    *_, decay, _, _, modules = printed(code, cwd=tmp_path).splitlines()
+    assert decay.split()[0] == "decay"
+    assert modules == "[]"
 
 
 def test_the_core_is_what_a_virtual_run_loads(tmp_path: Path) -> None:
