@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import mimetypes
 import threading
 from functools import partial
@@ -40,7 +41,8 @@ def make_app(root: Path, access: Access | None = None, limits: Limits | None = N
     """
     allowed = access or Access()
     catalogue = Catalogue(root)
-    Image.preinit()  # takes 0.1 s, which the first answer should not
+    importlib.import_module("scipy.special")  # takes 0.3 s, which the first answer should not
+    Image.preinit()  # takes 0.1 s, likewise
     threading.Thread(target=catalogue.warm, daemon=True).start()
     api = Api(catalogue, limits or Limits(), Actions(catalogue).endpoints() if allowed.may_act else ())
     files = {path.name: _read_static(path) for path in sorted(STATIC.iterdir()) if path.suffix in _KINDS}
