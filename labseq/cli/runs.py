@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -46,8 +47,14 @@ COLUMNS: Final[Sequence[Column[RunEntry]]] = (
     Column("measured", lambda run: clean(str(run.results[0])) if run.results else "-"),
     Column("shots", lambda run: "-" if run.shots is None else _shots(run), right=True),
     Column("state", lambda run: run.status),
-    Column("note", lambda run: clean(" ".join([*(f"[{tag}]" for tag in run.tags), run.note]).strip())),
+    Column("note", lambda run: clean(_note(run))),
 )
+
+
+def _note(run: RunEntry) -> str:
+    """Tags and note; of a run that has failed also why, without the name of the error."""
+    why = "(" + re.sub(r"^[A-Z]\w*: ", "", run.error) + ")" if run.status == "failed" else ""
+    return " ".join(text for text in (*(f"[{tag}]" for tag in run.tags), run.note, why) if text)
 
 
 def _shots(run: RunEntry) -> str:

@@ -114,7 +114,7 @@ export function table(heads, rows, props = {}) {
       sorts.set(label, sort?.column !== i ? { column: i, sign: 1 } : sort.sign > 0 ? { column: i, sign: -1 } : null);
       patch(event.currentTarget.closest("table"), parts());
     })))),
-    el("tbody", {}, sorted(listed, sort).map((row) => el("tr", { class: row.mark ?? "" }, (row.cells ?? row).map((cell, i) => el("td", { class: heads[i]?.right ? "num" : "" }, cell ?? "–")))))];
+    el("tbody", {}, sorted(listed, sort).map((row) => el("tr", { class: row.mark ?? "" }, (row.cells ?? row).map((cell, i) => el("td", { class: heads[i]?.right ? "num" : heads[i]?.line ? "line" : "" }, cell ?? "–")))))];
   };
   return el("div.scroller", { tabindex: "0", role: "region", "aria-label": `${label}, a table` }, el("table", {}, parts()));
 }

@@ -27,14 +27,14 @@ export async function showRuns(main, _, asked) {
     } catch (error) { patch(found, failure(error)); }
   }
   function listOf(runs) {
-    const heads = ["", "run", "started", "profile", { text: "shots", right: true }, "status", "scanned", "measured", { text: "defect-free", right: true }, { text: "filling", right: true }, "comment"];
+    const heads = ["", "run", { text: "started", line: true }, "profile", { text: "shots", right: true }, "status", "scanned", "measured", { text: "defect-free", right: true }, { text: "filling", right: true }, "comment"];
     return table(heads, () => runs.map((run) => [
       el("input", { type: "checkbox", checked: chosen.has(run.id), "aria-label": `Choose ${run.id} to compare`, onchange: (event) => { event.target.checked ? chosen.add(run.id) : chosen.delete(run.id); compare.disabled = chosen.size !== 2; } }),
       runLink(run.id), localTime(run.started_utc), run.profile, run.n_shots === null ? "–" : `${run.n_done} of ${run.n_shots}`,
       [statusPill(run.status), run.simulated ? el("span.tag", {}, "simulated") : null, run.has_scan ? el("span.tag", {}, "scan") : null].filter(Boolean),
       run.scanned || "–", resultsOf(run).join(", ") || "–",
       percent(run.defect_free), percentWithError(run.filling, run.filling_interval),
-      [run.tags.map((tag) => el("span.tag", {}, tag)), " ", (run.comment || (run.status === "damaged" ? run.error : "")).slice(0, 120)],
+      [run.tags.map((tag) => el("span.tag", {}, tag)), " ", run.comment.slice(0, 120), run.error ? el("small.reason", {}, run.error) : null].filter(Boolean),
     ].map((cell) => (Array.isArray(cell) ? el("span", {}, cell) : cell))), { label: "Runs" });
   }
   // Of a run in progress, means: its fits are on its page.

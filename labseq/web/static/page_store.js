@@ -30,7 +30,7 @@ export async function showQueue(main) {
 const AHEAD = ["running", "interrupted", "waiting"], EARLY = ["stopped", "failed", "skipped"];
 
 function entries(all, act) {
-  const heads = [{ text: "id", right: true }, "state", "sequence", "begun", "ends", "changed values and rules", "run", ...(server.may_act ? ["order"] : [])];
+  const heads = [{ text: "id", right: true }, "state", "sequence", { text: "begun", line: true }, { text: "ends", line: true }, "changed values and rules", "run", ...(server.may_act ? ["order"] : [])];
   return table(heads, all.map((one, i) => {
     const changed = [...Object.entries(one.options).map(([k, v]) => `${k} = ${v}`), ...one.rules].join(", ");
     const ends = one.ends_utc ? `${AHEAD.includes(one.state) ? "about " : ""}${localTime(one.ends_utc)}` : "–";
