@@ -119,10 +119,13 @@ def entries(root: Path, names: Iterable[tuple[str, str]], words: Sequence[str] =
         words: Only entries whose text contains all of these, in lower case.
     """
     connection, new = _connected(root), dict[str, Kept]()
+    kept_day, kept = "", dict[str, Kept]()
     try:
         for day, name in names:
+            if day != kept_day:
+                kept_day, kept = day, _kept(connection, day)
             folder, key = f"{root}/{day}/{name}", f"{day}/{name}"
-            stamp, before, entry = _stamp(folder), _kept(connection, key), None
+            stamp, before, entry = _stamp(folder), kept.get(key), None
             if before is not None and before.stamp == stamp:
                 if not _contains(before.text, words):
                     continue
@@ -198,14 +201,14 @@ def _connected(root: Path) -> sqlite3.Connection | None:
     return None
 
 
-def _kept(connection: sqlite3.Connection | None, name: str) -> Kept | None:
-    """What is kept of a run."""
-    if connection is None:
-        return None
+def _kept(connection: sqlite3.Connection | None, day: str) -> dict[str, Kept]:
+    """What is kept of the runs of a day, by day and name."""
     with suppress(sqlite3.Error):
-        rows = connection.execute("select stamp, text, entry from runs_2 where name = ?", (name,))
-        return next(map(Kept._make, rows.fetchall()), None)
-    return None
+        if connection is not None:
+            of_day = "select * from runs_2 where name >= ? and name < ?"  # "0" is the character after "/"
+            rows = connection.execute(of_day, (f"{day}/", f"{day}0")).fetchall()
+            return {name: Kept(*columns) for name, *columns in rows}
+    return {}
 
 
 def _keep(connection: sqlite3.Connection | None, new: Mapping[str, Kept]) -> None:
