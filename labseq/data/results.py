@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from labseq.data.best import best_point
 from labseq.data.fits import Fit
@@ -46,7 +47,7 @@ def own_fits(run: Run, scan: Scanned, quantity: Quantity, means: Sequence[Estima
     try:
         return fits_along(run, scan, quantity, means, request_of(wanted))
     except ConfigError as error:
-        problem = "; ".join(problem.what for problem in error.problems)
+        problem = "; ".join(str(replace(problem, source="")) for problem in error.problems)
         return [FitAt({}, {}, None, f"no fit {wanted['fit']}: {problem}")]
 
 

@@ -10,6 +10,7 @@ from rich.console import Console
 
 import labseq
 from labseq.cli.live import LiveView
+from labseq.cli.summary import Summary
 from labseq.data.follower import Follower
 
 SEQUENCE = Path(__file__).parents[2] / "sequences" / "lifetime.yaml"
@@ -25,3 +26,11 @@ def test_the_view_shows_the_fitted_value_as_the_summary_does(tmp_path: Path) -> 
     Console(file=screen, width=80, height=24).print(view.picture)
     decay = run.fit("survival:before,after", "exponential").parameters["decay"]
     assert re.search(rf"decay +{re.escape(str(decay))}", screen.getvalue())
+
+
+def test_the_summary_says_what_a_fit_that_failed_needs(tmp_path: Path) -> None:
+    with labseq.Session.open(SEQUENCE, shots=2, seed=1, output=tmp_path) as session:
+        run = session.run()
+    ((_, reason),) = Summary.of(run).results
+    assert reason.startswith("no fit exponential: 2 points are too few for a fit of 2 parameters")
+    assert reason.endswith("expected at least 3 different values with a result")
