@@ -21,6 +21,8 @@ from labseq.recording.run_file import SCANNER
 
 PAUSE: Final = 100.0
 """Minimum time between two fits, as a multiple of what the last one took: they delay shots by 1 % at most."""
+MAX_PAUSE_S: Final = 20.0
+"""Maximum time between two fits, in seconds: the first takes longer, as it loads what the others use."""
 
 
 class LiveFits:
@@ -63,7 +65,8 @@ class LiveFits:
             self._fit(lines)
         except RecordingError:  # run.json cannot be read: the summary tells why
             self._series = []
-        self._next_s = time.monotonic() + PAUSE * (time.monotonic() - began_s)
+        ended_s = time.monotonic()
+        self._next_s = ended_s + min(PAUSE * (ended_s - began_s), MAX_PAUSE_S)
 
     def _fit(self, lines: Mapping[int, Sequence[int]]) -> None:
         run = self._run = self._run or open_run(self._run_dir)
