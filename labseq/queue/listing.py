@@ -98,12 +98,15 @@ class EntryRow:
         return about + local_time(self.ends_utc)
 
     @property
-    def options_text(self) -> str:
-        """The options that differ from their defaults."""
+    def changes(self) -> dict[str, str]:
+        """The options that differ from their defaults; of the profile's path, the name is enough here."""
         changes = self.options.changes()
-        if self.options.profile is not None:  # of a path, the name is enough here
-            changes["profile"] = Path(self.options.profile).stem
-        values = [f"{address}={value}" for address, value in changes.items()]
+        return changes | ({"profile": Path(changes["profile"]).stem} if "profile" in changes else {})
+
+    @property
+    def options_text(self) -> str:
+        """The options and rules that differ from their defaults."""
+        values = [f"{address}={value}" for address, value in self.changes.items()]
         return clean(", ".join([*values, *rule_texts(self.rules)]))
 
     @property

@@ -50,7 +50,7 @@ def _entry(row: EntryRow) -> dict[str, Any]:
         "added_utc": text_of(row.added_utc, 40),
         "begun_utc": row.begun_utc,
         "ends_utc": row.ends_utc,
-        "options": {text_of(k, 200): text_of(v, 200) for k, v in row.options.changes().items()},
+        "options": {text_of(k, 200): text_of(v, 200) for k, v in row.changes.items()},
         "rules": [text_of(text, 200) for text in rule_texts(row.rules)],
         "run": None if row.run_dir is None else text_of(run_id(row.run_dir), 300),
         "error": text_of(row.error or ""),
