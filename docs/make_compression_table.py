@@ -27,7 +27,7 @@ N_SAMPLES: Final = 3125
 FREQUENCY_HZ: Final = CENTRE_HZ + STEP_HZ * (np.arange(N_TONES) - N_TONES // 2)
 WAVES: Final = np.exp(2j * np.pi * np.outer(FREQUENCY_HZ, np.arange(N_SAMPLES) / RATE_HZ))
 THRESHOLD: Final = 1.56 / 2.1
-"""Depth below which `paper.yaml` loses atoms, in depths of a single tone."""
+"""The depth of 12.5 tones, where the paper suspects a threshold, in depths of a single tone."""
 
 
 def depths(drive: Floats, phase: Floats, level: float) -> Floats:

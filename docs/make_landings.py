@@ -19,8 +19,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from labseq_virtual.flight import KELVIN, STEP_S, draw_atoms
-from labseq_virtual.flight_kernels import energies, follow_atoms, new_flights
+from labseq_virtual.flight import Conditions, machine
+from labseq_virtual.flight_kernels import fly_in_light
+from labseq_virtual.formulas import KELVIN
+from labseq_virtual.records import FATES, SITE
 from labseq_virtual.settings import SimulationSettings
 from numpy.typing import NDArray
 
@@ -60,44 +62,32 @@ class TweezerPath:
     temperature_k: float = STATIC.temperature
 
 
-def follow(path: TweezerPath, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Let a tweezer pass or land on each of a group of atoms; their energies before and after, in kelvin.
-
-    They are counted from the bottom of the static tweezer; inf for an atom that is lost.
-    """
-    waists = np.array([STATIC.static_waist, STATIC.mobile_light.waist])
-    rayleigh = math.pi * waists**2 / [STATIC.static_wavelength, STATIC.mobile_light.wavelength]
-    beams = np.array([waists[0], rayleigh[0], waists[1], rayleigh[1]])
-    depth = np.full(GROUP, KELVIN * STATIC.static_depth)
-    state = draw_atoms(depth, KELVIN * path.temperature_k, beams[0], beams[1], rng)
-    sites: Floats = np.zeros((GROUP, 2))
-    sites[:, 0] = APART_M * np.arange(GROUP)
-    state[:, :2] += sites
-    before = energies(state, sites, depth, beams[0], beams[1])
+def follow(path: TweezerPath, rng: np.random.Generator) -> Floats:
+    """Let a tweezer pass or land on each of a group of atoms; their temperatures then, nan for lost ones."""
+    sites = np.zeros((1, GROUP), SITE)
+    sites["atom"], sites["depth"], sites["heat"] = True, KELVIN * STATIC.static_depth, path.temperature_k
     down, right = np.array([0.0, 2 * HALF_M]), np.array([APART_M, 0.0])
     plane = np.vstack([np.zeros(2), down, right, np.linalg.inv(np.stack([down, right], axis=1))])
-    n_frames = len(path.along_m)
-    columns = np.tile(np.arange(float(GROUP)) + path.beside_m / APART_M, (n_frames, 1))
-    alive, record = np.ones(GROUP, np.bool_), new_flights(GROUP)
-    follow_atoms(
-        state, alive, record,
-        path.along_m[:, None] / (2 * HALF_M), path.fraction[:, None].copy(), columns, np.ones_like(columns),
-        FRAME_S * np.arange(n_frames, dtype=np.float64), depth[None], KELVIN * path.depth_k,
-        np.ascontiguousarray(plane), beams, math.ceil(FRAME_S / STEP_S), np.zeros(GROUP), 0.0,
+    columns = np.tile(np.arange(float(GROUP))[:, None] + path.beside_m / APART_M, len(path.along_m))
+    light = SimulationSettings().mobile_light.model_copy(update={"depth": path.depth_k})
+    numbers = machine(
+        STATIC.model_copy(update={"mobile_light": light, "transport_loss": 0.0}), Conditions(cooled=0.0)
+    )
+    fly_in_light(
+        sites, path.along_m[None] / (2 * HALF_M), path.fraction[None].copy(), columns, np.ones_like(columns),
+        0.0, FRAME_S, numbers, np.ascontiguousarray(plane), rng, np.zeros(len(FATES), np.int64),
     )  # fmt: skip
-    after = energies(state, sites, depth, beams[0], beams[1])
-    after[~alive | (after >= 0)] = np.inf
-    return (before + depth[0]) / KELVIN, (after + depth[0]) / KELVIN
+    return np.where(sites["atom"][0], sites["heat"][0], np.nan)
 
 
 def results(path: TweezerPath, n_atoms: int) -> list[str]:
     """The fraction of the atoms that are lost, and the heating of the others in uK."""
     rng = np.random.default_rng(1)
-    before, after = np.hstack([follow(path, rng) for _ in range(math.ceil(n_atoms / GROUP))])
-    lost = np.isinf(after)
+    after = np.hstack([follow(path, rng) for _ in range(math.ceil(n_atoms / GROUP))])
+    lost = np.isnan(after)
     n, kept, loss = len(after), after[~lost], float(lost.mean())
     error = math.sqrt(max(loss * (1 - loss), 1 / n) / n)
-    heating = "-" if len(kept) < n / 10 else f"{(kept.mean() - before.mean()) / 3 * 1e6:.1f}"
+    heating = "-" if len(kept) < n / 10 else f"{(kept.mean() - path.temperature_k) * 1e6:.1f}"
     return [f"{100 * loss:.2f}({100 * error:.2f}) %", heating]
 
 

@@ -58,16 +58,12 @@ WINDOWS_MS = {2: 94, 3: 68}
 POINTS = [(dop, 200) for dop in range(2, 16)] + [(dop, WINDOWS_MS.get(dop, 60)) for dop in range(2, 16)]
 """Degree of parallelism and window in ms of each point of figure 4."""
 UNTUNED = (
-    "profile.simulation.transport_loss=2.12 %",
-    "profile.simulation.transport_loss_per_tone=0 %",
     "profile.simulation.transport_loss_spread=0",
-    "profile.simulation.mobile_light.depth_drop_per_tone=0 %",
-    "profile.simulation.mobile_light.adiabatic_depth=0 uK",
     "profile.simulation.imaging_loss=0.314 %",
 )
 """Overrides of the profile `paper`, after which only the loss of a moved atom is fitted."""
 GRID = ("planner={use: grid, degree_of_parallelism: 7, lanes: weaving}",)
-"""Overrides for the planner `grid`; the profile `paper` does not bear shallower tweezers on the way."""
+"""Overrides for the planner `grid`."""
 SERIES_5: dict[str, tuple[str, tuple[str, ...]]] = {
     "figure5": ("profile `paper`", ()),
     "figure5_no_repair": ("the same, repair off", ("planner.repair_below=0",)),

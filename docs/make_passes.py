@@ -19,8 +19,10 @@ from typing import Final
 
 import numpy as np
 from labseq_grid.planner import WEAVE
-from labseq_virtual.flight import KELVIN, STEP_S, draw_atoms
-from labseq_virtual.flight_kernels import energies, follow_atoms, new_flights
+from labseq_virtual.flight import Conditions, machine
+from labseq_virtual.flight_kernels import fly_in_light
+from labseq_virtual.formulas import KELVIN
+from labseq_virtual.records import FATES, SITE
 from labseq_virtual.settings import SimulationSettings
 
 from labseq.model import MotionSpec
@@ -49,28 +51,23 @@ def n_taken(
     lane_m: float, swing_m: float, depth_k: float, temperature_k: float, rng: np.random.Generator
 ) -> int:
     """Let a tweezer pass each of a group of atoms once; count those that their static tweezer loses."""
-    waists = np.array([STATIC.static_waist, STATIC.mobile_light.waist])
-    rayleigh = math.pi * waists**2 / [STATIC.static_wavelength, STATIC.mobile_light.wavelength]
-    beams = np.array([waists[0], rayleigh[0], waists[1], rayleigh[1]])
-    depth = np.full(GROUP, KELVIN * STATIC.static_depth)
-    state = draw_atoms(depth, KELVIN * temperature_k, beams[0], beams[1], rng)
-    sites = np.zeros((GROUP, 2))
-    sites[:, 0] = APART_M * np.arange(GROUP)
-    state[:, :2] += sites
+    sites = np.zeros((1, GROUP), SITE)
+    sites["atom"], sites["depth"], sites["heat"] = True, KELVIN * STATIC.static_depth, temperature_k
     down, right = np.array([0.0, REACH_M]), np.array([APART_M, 0.0])
     plane = np.vstack([np.zeros(2), down, right, np.linalg.inv(np.stack([down, right], axis=1))])
     n_frames = round(2 * REACH_M / MotionSpec().speed_m_s / FRAME_S)
-    rows = np.linspace(1.0, -1.0, n_frames + 1)[:, None].copy()
+    rows = np.linspace(1.0, -1.0, n_frames + 1)[None]
     swing = swing_m * np.cos(2 * math.pi * REACH_M / SPACING_M * rows)
-    columns = np.arange(float(GROUP)) + (lane_m + swing) / APART_M
-    alive, record = np.ones(GROUP, np.bool_), new_flights(GROUP)
-    follow_atoms(
-        state, alive, record, rows, np.ones_like(rows), columns, np.ones_like(columns),
-        FRAME_S * np.arange(n_frames + 1, dtype=np.float64), depth[None], KELVIN * depth_k,
-        np.ascontiguousarray(plane), beams, math.ceil(FRAME_S / STEP_S), np.zeros(GROUP), 0.0,
+    columns = np.arange(float(GROUP))[:, None] + (lane_m + swing) / APART_M
+    light = SimulationSettings().mobile_light.model_copy(update={"depth": depth_k})
+    numbers = machine(
+        STATIC.model_copy(update={"mobile_light": light, "transport_loss": 0.0}), Conditions(cooled=0.0)
+    )
+    fly_in_light(
+        sites, rows, np.ones_like(rows), columns, np.ones_like(columns), 0.0, FRAME_S, numbers,
+        np.ascontiguousarray(plane), rng, np.zeros(len(FATES), np.int64),
     )  # fmt: skip
-    kept = alive & (energies(state, sites, depth, beams[0], beams[1]) < 0)
-    return int(np.count_nonzero(~kept))
+    return GROUP - int(sites["atom"].sum())
 
 
 def main() -> None:

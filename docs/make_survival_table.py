@@ -2,7 +2,7 @@
 
     python docs/make_survival_table.py --shots 1000
 
-In each of ten settings, shots are loaded, planned on the true occupancy, played, and followed by one
+In each of nine settings, shots are loaded, planned on the true occupancy, played, and followed by one
 exposure. Counted are the atoms that the moves, the exposure and the vacuum take until its end,
 and the shots whose target is then whole; predicted are both for the same plans.
 """
@@ -62,7 +62,6 @@ SETTINGS: Final = (
     Setting("grid", 20),
     Setting("grid", 15, {"move": 0.005}),
     Setting("grid", 15, {"spread": 0.0}),
-    Setting("grid", 15, {"tone": 0.002}),
     Setting("grid", 15, {"lifetime_s": 15.0}),
     Setting("psca", 15, {"move": 0.005}, loading=0.9),
 )
@@ -75,7 +74,6 @@ def measure(setting: Setting, n_shots: int) -> dict[str, tuple[Estimate, Estimat
     settings = SimulationSettings.model_validate(
         {
             "transport_loss": losses.move,
-            "transport_loss_per_tone": losses.tone,
             "transport_loss_spread": losses.spread,
             "lifetime": losses.lifetime_s,
             "loading": setting.loading,

@@ -338,7 +338,7 @@ def _lowering(x: Floats, temperature: float, amplitude: float, depth: float) -> 
     """Fraction of atoms that stay in a tweezer whose depth is slowly reduced to a fraction x.
 
     An adiabatic ramp keeps atoms below an energy that goes as a power of the depth; scale and exponent
-    describe atoms moved by Newton's equations in a Gaussian beam (``docs/make_response_tables.py``).
+    describe atoms moved by Newton's equations in a Gaussian beam.
     Energies are distributed as in a harmonic well.
 
     Args:

@@ -1,4 +1,8 @@
-"""Transport of atoms by the light of a played RF output: drawing atoms, and moving them.
+"""Atoms that fly in the light of the mobile tweezers: of a tone program, or of a played RF output.
+
+The tweezers are the crossings of the row tones and the column tones that are on. The purpose of a segment
+(its kind, its batch) is ignored: only tones count, so a wrong program has the effect that it would have in
+the lab.
 
 Energies and depths inside are per mass of the atom, in m^2/s^2.
 """
@@ -7,17 +11,27 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import MotionSpec, SiteGrid
+from labseq.plugin import MotionSpec, SiteGrid, ToneProgram
+from labseq.plugin.motion import FrequencyCourse
 from labseq_virtual.atoms import Atoms
-from labseq_virtual.handover import KELVIN, full_volts, pair_survival
+from labseq_virtual.formulas import (
+    KELVIN,
+    full_amplitudes,
+    full_volts,
+    noise_hz,
+    pair_survival,
+    rayleigh_length,
+)
 from labseq_virtual.jumps import JUMPS, find_jumps
+from labseq_virtual.records import FATES, SITE, TONE
 from labseq_virtual.rf_analysis import (
     WINDOW,
     RfPulse,
@@ -32,69 +46,8 @@ from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.tone_positions import TonePositions
 
 Floats = NDArray[np.float64]
-
-WIDER: Final = np.array([2.2, 2.2, 4.0])
-"""Width of the proposed positions relative to a harmonic well's, (x, y, z): covers a beam's weaker flanks."""
-PROPOSALS: Final = 32
-"""Proposals drawn at once for each atom still to be placed; about one in twenty is accepted."""
-
-
-def draw_atoms(
-    depth: Floats, temperature: float | Floats, waist: float, rayleigh: float, rng: np.random.Generator
-) -> Floats:
-    """Draw atoms from the Boltzmann distribution in a Gaussian beam, restricted to bound atoms.
-
-    Positions have the density ``exp(a) P(a)``, where ``a = -U / kT`` and
-    ``P(a) = erf(sqrt(a)) - 2 sqrt(a / pi) exp(-a)`` is the fraction of the Maxwell distribution slow enough
-    to be bound there. They are drawn by rejection from a wider Gaussian. This distribution is stationary;
-    the harmonic one would breathe. In tweezers too shallow for the temperature, the temperature is half of
-    the depth: hotter atoms have evaporated.
-
-    Args:
-        depth: Depth of each atom's tweezer per mass, (n_atoms,), above 0.
-        temperature: kT per mass, of all or of each atom.
-        waist: 1/e^2 radius of the intensity.
-        rayleigh: Rayleigh length.
-        rng: Random numbers.
-
-    Returns:
-        Positions relative to the tweezers' foci, and velocities, (n_atoms, 6).
-    """
-    from scipy.special import erf
-
-    kt = np.minimum(temperature, depth / 2)
-    most = depth / kt
-    size = np.array([waist, waist, rayleigh])
-    spread = WIDER / np.sqrt(np.array([4.0, 4.0, 2.0]) * most[:, None])
-    atoms = np.empty((len(depth), 6))
-    bound = np.zeros(len(depth))
-    remaining = np.arange(len(depth))
-    while len(remaining):
-        normal = rng.standard_normal((len(remaining), PROPOSALS, 3))
-        place = normal * spread[remaining, None]
-        s = 1.0 + place[..., 2] ** 2
-        a = most[remaining, None] / s * np.exp(-2 * (place[..., 0] ** 2 + place[..., 1] ** 2) / s)
-        slow = erf(np.sqrt(a)) - 2 * np.sqrt(a / np.pi) * np.exp(-a)
-        weight = np.exp(a - most[remaining, None] + 0.5 * (normal**2).sum(axis=-1)) * slow
-        is_accepted = rng.random(weight.shape) < weight
-        first = is_accepted.argmax(axis=1)
-        is_placed = is_accepted[np.arange(len(remaining)), first]
-        atoms[remaining[is_placed], :3] = place[is_placed, first[is_placed]] * size
-        bound[remaining[is_placed]] = a[is_placed, first[is_placed]]
-        remaining = remaining[~is_placed]
-    remaining = np.arange(len(depth))
-    while len(remaining):
-        velocity = rng.standard_normal((len(remaining), 3))
-        slow = 0.5 * (velocity**2).sum(axis=1) < bound[remaining]
-        atoms[remaining[slow], 3:] = np.sqrt(kt[remaining[slow], None]) * velocity[slow]
-        remaining = remaining[~slow]
-    return atoms
-
-
 Mask = NDArray[np.bool_]
 
-STEP_S: Final = 0.1e-6
-"""Step of the integration, in seconds: a seventieth of a period in a tweezer of 2.1 mK."""
 DARK: Final = 0.1
 """Fraction of the full depth below which the tweezers of a batch have let go of their atoms (ours)."""
 MIN_TONE_DEPTH: Final = 2e-3
@@ -126,7 +79,7 @@ FLIGHTS: Final = np.dtype(
             "to_col": "column of the site that it came to, if it was kept",
             "offset_m": "how far the tweezer was from the site when it first held the atom",
             "depth_K": "greatest depth of the tweezer",
-            "fate": "kept, or the cause of the loss: ejected, collision, transport or hand_over",
+            "fate": "kept, or the cause of the loss: ejected, collision, transport, hand_over or program",
             "lost_s": "when it was lost, from the start of the shot; nan: never",
             "lost_row": "row where it was lost, in sites",
             "lost_col": "column where it was lost, in sites",
@@ -137,8 +90,45 @@ FLIGHTS: Final = np.dtype(
 "collision" with another, fallen out of its tweezer in "transport", or by the transport loss, "hand_over"."""
 
 
-class RfTransport:
-    """Moves atoms in the light of what the mobile tweezers' outputs played."""
+@dataclass(frozen=True, slots=True)
+class RunningProgram:
+    """A program that is being played.
+
+    Attributes:
+        program: The program.
+        t_start_s: When it started.
+    """
+
+    program: ToneProgram
+    t_start_s: float
+
+    @property
+    def t_end_s(self) -> float:
+        """Time of its end."""
+        return self.t_start_s + self.program.total_duration_s
+
+    def segment_at(self, t_s: float) -> tuple[int, float]:
+        """The segment that is played at a time, and for how long; that after the last at the end."""
+        joint_s = self.program.joint_s
+        k = int(np.searchsorted(joint_s[1:], t_s - self.t_start_s, side="right"))
+        return k, max(0.0, t_s - self.t_start_s - joint_s[k])
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What acts on the atoms during a program beside the tweezers.
+
+    Attributes:
+        loss_factor: Factor on the transport loss.
+        cooled: Fraction of the time with cooling light.
+    """
+
+    loss_factor: float = 1.0
+    cooled: float = 1.0
+
+
+class Flights:
+    """Moves atoms in the light of the mobile tweezers."""
 
     def __init__(
         self,
@@ -150,19 +140,15 @@ class RfTransport:
         light = settings.mobile_light
         self._grid, self._motion, self._settings, self._light = grid, motion, settings, light
         self._positions = positions or TonePositions(grid, light)
-        self._full_v = full_volts(grid, motion)
+        self._full, self._full_v = full_amplitudes(grid, motion), full_volts(grid, motion)
         self._bands = bands(grid)
         axes_hz = grid.row_frequency_hz, grid.column_frequency_hz
         self.reach_hz = [reach_hz(hz, motion.eject_slots) for hz in axes_hz]
+        row_hz, col_hz = (float(np.abs(np.diff(hz)).mean()) if len(hz) > 1 else 0.0 for hz in axes_hz)
+        self._step_hz = row_hz, col_hz
         a1, a2 = grid.axes
         inverse = np.linalg.inv(np.stack([a2, a1], axis=1))
         self._plane = np.ascontiguousarray(np.vstack([grid.positions_m[0, 0], a2, a1, inverse]))
-        waists = settings.static_waist, light.waist
-        rayleigh = [
-            math.pi * w**2 / wavelength
-            for w, wavelength in zip(waists, (settings.static_wavelength, light.wavelength), strict=True)
-        ]
-        self._beams = np.array([waists[0], rayleigh[0], waists[1], rayleigh[1]])
         self.margin_s = (WINDOW + 0.5) * light.transit_time
         self._flights: list[NDArray[Any]] = []
         self._jumps: list[tuple[Any, ...]] = []
@@ -188,90 +174,69 @@ class RfTransport:
         jumps["t_s"] -= since_s
         return {"flights": flights.view(FLIGHTS), "jumps": jumps.view(JUMPS)}  # with their descriptions
 
-    def carry(
+    def carry_program(
+        self,
+        atoms: Atoms,
+        running: RunningProgram,
+        depth: Floats,
+        rng: np.random.Generator,
+        conditions: Conditions = Conditions(),
+        until_s: float = math.inf,
+    ) -> Counter[str]:
+        """Move the atoms by a program, whose tones are played exactly as stated.
+
+        Args:
+            atoms: The atoms; changed in place.
+            running: The program.
+            depth: float64 (n_rows, n_cols), depths of the static tweezers relative to the nominal one.
+            rng: Random numbers of the shot.
+            conditions: What else acts on the atoms.
+            until_s: When all tones go off, if that is before the end of the program.
+
+        Returns:
+            Number of atoms lost by each cause that lost any.
+        """
+        from labseq_virtual.flight_kernels import fly_in_program
+        from labseq_virtual.light_kernels import FRAMES_PER_TRANSIT
+
+        program, n_lost = running.program, np.zeros(len(FATES), np.int64)
+        sites, durations_s = self._sites(atoms, depth), program.duration_s
+        rows, cols = self._tones(program, 0), self._tones(program, 1)
+        n_segments, played_s = running.segment_at(until_s)
+        if n_segments < program.n_segments and played_s > 0:
+            for axis, tones in ((program.row, rows), (program.column, cols)):
+                part = tones[axis.offsets[n_segments] : axis.offsets[n_segments + 1]]
+                _cut(part, FrequencyCourse(program.course[n_segments]), played_s / durations_s[n_segments])
+            durations_s = np.append(durations_s[:n_segments], played_s)
+            n_segments += 1
+        fly_in_program(
+            sites, rows, program.row.offsets, cols, program.column.offsets, durations_s, program.course,
+            n_segments, self._step_hz, running.t_start_s, self._light.transit_time / FRAMES_PER_TRANSIT,
+            machine(self._settings, conditions), self._plane, rng, n_lost,
+        )  # fmt: skip
+        return _settle(atoms, sites, n_lost)
+
+    def carry_pulse(
         self,
         atoms: Atoms,
         pulse: RfPulse,
         depth: Floats,
         rng: np.random.Generator,
-        loss_factor: float,
-        relax: Callable[[Floats, Floats], Floats] = lambda heat, _elapsed_s: heat,
-        pairs: float | None = None,
+        conditions: Conditions = Conditions(),
     ) -> Counter[str]:
-        """Move the atoms in the light of a pulse.
+        """Move the atoms in the light of a pulse that the outputs played; arguments as ``carry_program``."""
+        from labseq_virtual.flight_kernels import fly_in_light
 
-        Args:
-            atoms: The atoms; changed in place.
-            pulse: The output that was played.
-            depth: float64 (n_rows, n_cols), depths of the static tweezers relative to the nominal one.
-            rng: Random numbers of the shot.
-            loss_factor: The shot's factor on the transport loss.
-            relax: Temperatures after a time without moves, in s.
-            pairs: Probability that one of two atoms that meet is left. By default that of the settings.
-
-        Returns:
-            Number of atoms lost by each cause: hand_over, transport, collision, ejected.
-        """
-        lost: Counter[str] = Counter()
-        pairs = pair_survival(self._settings) if pairs is None else pairs
+        n_lost, numbers = np.zeros(len(FATES), np.int64), machine(self._settings, conditions)
+        sites = self._sites(atoms, depth)
         for tones, t_s in self.find_tones(pulse):
-            bright = np.flatnonzero(_light([tones[1], tones[3]]) > DARK)
-            on_s, off_s = t_s[bright[[0, -1]]] if len(bright) else t_s[[0, -1]]
-            atoms.heat = relax(atoms.heat, np.maximum(0.0, on_s - atoms.since_s))
-            atoms.since_s[...] = on_s
-            lost += self._carry_batch(atoms, tones, t_s, depth, rng, loss_factor, off_s, pairs)
-        return lost
-
-    def _carry_batch(
-        self,
-        atoms: Atoms,
-        tones: tuple[Floats, ...],
-        t_s: Floats,
-        depth: Floats,
-        rng: np.random.Generator,
-        loss_factor: float,
-        off_s: float,
-        pairs: float,
-    ) -> Counter[str]:
-        from labseq_virtual.flight_kernels import follow_atoms, new_flights
-
-        rows, row_depth, cols, col_depth = tones
-        row, col = np.nonzero(atoms.occupied & self._near(rows, cols) & (depth > 0))
-        static = KELVIN * self._settings.static_depth * np.ascontiguousarray(depth)
-        kt = KELVIN * atoms.heat[row, col] * np.sqrt(depth[row, col])
-        state = draw_atoms(static[row, col], kt, self._beams[0], self._beams[1], rng)
-        state[:, :2] += self._grid.positions_m[row, col]
-        alive = np.ones(len(row), np.bool_)
-        record = new_flights(len(row))
-        n_steps = math.ceil((t_s[1] - t_s[0]) / STEP_S)
-        full = KELVIN * self._light.depth
-        luck = rng.spawn(1)[0].random(len(row))
-        follow_atoms(
-            state, alive, record, rows, row_depth, cols, col_depth, t_s,
-            static, full, self._plane, self._beams, n_steps, luck, pairs,
-        )  # fmt: skip
-        to_row, to_col, energy = self._arrivals(state, static)
-        bound = energy < 0
-        held = ~np.isnan(record["held_s"])
-        flights = np.zeros(len(row), FLIGHTS)
-        flights["offset_m"], flights["depth_K"] = record["offset"], record["depth"] / KELVIN
-        for name in ("held_s", "lost_s", "lost_row", "lost_col"):
-            flights[name] = record[name]
-        flights["from_row"], flights["from_col"] = row, col
-        flights["to_row"], flights["to_col"] = to_row, to_col
-        n_tones = max(0, _max_on(rows) + _max_on(cols) - 2)
-        loss = self._settings.transport_loss + n_tones * self._settings.transport_loss_per_tone
-        unlucky = held & (rng.random(len(row)) < loss * loss_factor)
-        self._assign_fates(flights, alive, record["collided"] == 1, bound, unlucky, float(t_s[-1]))
-        kept = flights["fate"] == b"kept"
-        atoms.occupied[row, col] = False
-        atoms.occupied[to_row[kept], to_col[kept]] = True
-        moved = kept & held
-        at = to_row[moved], to_col[moved]
-        atoms.heat[at] = (energy[moved] + static[at]) / 3 / KELVIN / np.sqrt(depth[at])
-        atoms.since_s[at] = off_s
-        self._flights.append(flights[held | ~kept])
-        return Counter(fate.decode() for fate in flights["fate"][~kept].tolist())
+            rows, row_depth, cols, col_depth = (np.ascontiguousarray(values.T) for values in tones)
+            flights = fly_in_light(
+                sites, rows, row_depth, cols, col_depth, t_s[0], t_s[1] - t_s[0], numbers, self._plane, rng,
+                n_lost,
+            )  # fmt: skip
+            self._flights.append(_table(flights))
+        return _settle(atoms, sites, n_lost)
 
     def find_tones(self, pulse: RfPulse) -> Iterator[tuple[tuple[Floats, ...], Floats]]:
         """Positions (in sites) and depth factors of row and column tones, and the times of the frames.
@@ -304,52 +269,71 @@ class RfTransport:
             parts = (values[frames][:, on[axis]] for axis in (0, 1) for values in (sites[axis], depths[axis]))
             yield tuple(map(np.ascontiguousarray, parts)), tracks_of_axes[0].t_s[frames]
 
-    def _near(self, rows: Floats, cols: Floats) -> Mask:
-        """Sites that any tweezer comes close to, bool (n_rows, n_cols)."""
-        n_rows, n_cols = self._grid.shape
-        return _lines(rows, n_rows).T.astype(np.float32) @ _lines(cols, n_cols).astype(np.float32) > 0
+    def _sites(self, atoms: Atoms, depth: Floats) -> NDArray[Any]:
+        """The sites and their atoms (n_rows, n_cols), see :class:`labseq_virtual.records.Site`."""
+        sites = np.zeros(depth.shape, SITE)
+        sites["atom"], sites["depth"] = atoms.occupied, KELVIN * self._settings.static_depth * depth
+        sites["heat"], sites["since_s"] = atoms.heat, atoms.since_s
+        return sites
 
-    def _arrivals(self, state: Floats, static: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-        """Row, column of the site nearest to each atom, its energy there; -1 and inf beyond the grid."""
-        from labseq_virtual.flight_kernels import energies
-
-        waist, rayleigh = self._beams[:2]
-        place = np.rint((state[:, :2] - self._plane[0]) @ self._plane[3:].T).astype(np.intp)
-        inside = ((place >= 0) & (place < self._grid.shape)).all(axis=1)
-        row, col = np.where(inside[:, None], place, 0).T
-        sites = self._grid.positions_m[row, col]
-        energy = np.where(inside, energies(state, sites, static[row, col], waist, rayleigh), np.inf)
-        return np.where(inside, row, -1), np.where(inside, col, -1), energy
-
-    def _assign_fates(
-        self, flights: NDArray[Any], alive: Mask, paired: Mask, bound: Mask, unlucky: Mask, end_s: float
-    ) -> None:
-        """Fill in the fates; atoms lost without a recorded time are lost at the end, where they are then."""
-        flights["fate"] = b"transport"
-        flights["fate"][alive & bound] = b"kept"
-        flights["fate"][alive & bound & unlucky] = b"hand_over"
-        to_row, to_col = flights["to_row"], flights["to_col"]
-        kept = np.flatnonzero(flights["fate"] == b"kept")
-        _, index, count = np.unique(
-            np.stack([to_row[kept], to_col[kept]]), axis=1, return_inverse=True, return_counts=True
-        )
-        flights["fate"][kept[count[index.ravel()] > 1]] = b"collision"
-        flights["fate"][paired] = b"collision"
-        flights["fate"][(to_row < 0) & ~paired] = b"ejected"
-        lost = flights["fate"] != b"kept"
-        late = lost & np.isnan(flights["lost_s"])
-        flights["lost_s"][late] = end_s
-        flights["lost_row"][late], flights["lost_col"][late] = to_row[late], to_col[late]
-        to_row[lost] = to_col[lost] = -1
+    def _tones(self, program: ToneProgram, index: int) -> NDArray[Any]:
+        """The tones of all segments of an axis, (n_tones,); see :class:`labseq_virtual.records.Tone`."""
+        axis, full = (program.row, program.column)[index], self._full[index]
+        sites = np.arange(len(full))
+        tones = np.empty(len(axis.start_hz), TONE)
+        for at, hz, amplitude in (
+            ("start", axis.start_hz, axis.start_amplitude),
+            ("end", axis.end_hz, axis.end_amplitude),
+        ):
+            intended = self._positions.intended(index, hz)
+            tones[at] = self._positions.actual(index, hz)
+            tones[f"power_{at}"] = (amplitude / np.interp(intended, sites, full)) ** 2
+        return tones
 
 
-def _lines(tracks: Floats, n_sites: int) -> Mask:
-    """The rows or columns on both sides of the tones of each frame, bool (n_frames, n_sites)."""
-    frame, tone = np.nonzero(~np.isnan(tracks))
-    below = np.clip(np.floor(tracks[frame, tone]).astype(np.intp), -2, n_sites) + 2
-    lines = np.zeros((len(tracks), n_sites + 4), np.bool_)
-    lines[frame, below] = lines[frame, below + 1] = True
-    return lines[:, 2 : n_sites + 2]
+def machine(settings: SimulationSettings, conditions: Conditions) -> tuple[float, ...]:
+    """The numbers of :class:`labseq_virtual.flight_kernels.Machine`."""
+    light = settings.mobile_light
+    return (
+        KELVIN * settings.static_depth,
+        settings.static_waist,
+        rayleigh_length(settings.static_waist, settings.static_wavelength),
+        KELVIN * light.depth,
+        light.waist,
+        rayleigh_length(light.waist, light.wavelength),
+        settings.temperature,
+        conditions.cooled / settings.cooling_time,
+        noise_hz(settings),
+        settings.transport_loss * conditions.loss_factor,
+        pair_survival(settings) if conditions.cooled > 0 else 0.0,
+    )
+
+
+def _cut(tones: NDArray[Any], course: FrequencyCourse, u: float) -> None:
+    """End the tones of a segment after a fraction u of it."""
+    tones["end"] = tones["start"] + (tones["end"] - tones["start"]) * course.fraction(u)
+    tones["power_end"] = tones["power_start"] + (tones["power_end"] - tones["power_start"]) * u
+
+
+def _settle(atoms: Atoms, sites: NDArray[Any], n_lost: NDArray[np.int64]) -> Counter[str]:
+    """Take over the atoms from the sites; returns the number of atoms lost by each cause."""
+    atoms.occupied[...] = sites["atom"]
+    atoms.heat[...], atoms.since_s[...] = sites["heat"], sites["since_s"]
+    causes: dict[str, int] = dict(zip(FATES[1:], n_lost[1:].tolist(), strict=True))
+    return +Counter(causes)
+
+
+def _table(flights: NDArray[Any]) -> NDArray[Any]:
+    """The rows of :data:`FLIGHTS` of the atoms that were held or lost."""
+    flights = flights[~np.isnan(flights["held_s"]) | (flights["fate"] > 0)]
+    table = np.zeros(len(flights), FLIGHTS)
+    for name in ("held_s", "from_row", "from_col", "to_row", "to_col", "lost_s", "lost_row", "lost_col"):
+        table[name] = flights[name]
+    table["offset_m"], table["depth_K"] = flights["offset"], flights["depth"] / KELVIN
+    table["fate"] = np.array(FATES, "S9")[flights["fate"]]
+    lost = flights["fate"] > 0
+    table["to_row"][lost] = table["to_col"][lost] = -1
+    return table
 
 
 def _light(depths: list[Floats]) -> Floats:
@@ -363,7 +347,3 @@ def _batches(bright: Mask) -> list[slice]:
     edges = np.flatnonzero(np.diff(bright, prepend=False, append=False))
     cuts = [0, *((edges[1:-1:2] + edges[2::2]) // 2).tolist(), len(bright) - 1]
     return [slice(first, last + 1) for first, last in pairwise(cuts)]
-
-
-def _max_on(tracks: Floats) -> int:
-    return int((~np.isnan(tracks)).sum(axis=1).max(initial=0))

@@ -1,10 +1,17 @@
 """Kernels that integrate the motion of atoms in the light of static and mobile tweezers.
 
-Energies and depths are per mass, in m^2/s^2. Two arrays stand for several numbers:
+Energies and depths are per mass, in m^2/s^2. Arguments that occur in several kernels:
 
 - ``atom``: position (m) and velocity (m/s), (6,).
 - ``plane``: position of site (0, 0), step from row to row, step from column to column, in m; then
   the inverse of the steps, so that ``plane[3:] @ (x, y)`` is in sites (5, 2).
+- ``rows``, ``cols``: the tones from frame to frame, :func:`labseq_virtual.light_kernels.course_of`.
+- ``flights``, ``state``: the atoms near which a tweezer came so far, :class:`Flight` and ``atom`` of each.
+- ``sites``: the sites and their atoms, ``Site`` (n_rows, n_cols).
+- ``machine``: the constants, :class:`Machine`.
+
+Atoms that need it are integrated in single precision, several at once, so that the compiler uses the
+processor's vector instructions: they are the *lanes* of a flat array.
 """
 
 from __future__ import annotations
@@ -16,94 +23,127 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import const, helper_kernel, kernel
-from labseq_virtual.records import record, signature
+from labseq_virtual.formulas import KELVIN
+from labseq_virtual.light_kernels import (
+    CHANGE,
+    CUT,
+    DEPTH,
+    HALF,
+    MIXED,
+    NEVER,
+    PLACE,
+    WAY,
+    course_of,
+    find_batches,
+    light_of_axis,
+)
+from labseq_virtual.records import SITE, TONE, Site, record, signature
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Records = Any
 """An array of records: numpy has no type for one that knows its columns."""
 
-TABLE = const("float64", 2)
-VECTOR = const("float64", 1)
-
-NEAR = 3.5
-"""Distance in waists beyond which a tweezer is neglected: there it has 2e-11 of its depth."""
+NEAR = 3.0
+"""Distance in waists beyond which a tweezer is neglected: there it has 2e-8 of its depth."""
 GONE = 2.0
 """Distance in waists from every tweezer beyond which an unbound atom counts as lost (ours)."""
 HIGH = 4.0
 """Distance from the plane in Rayleigh lengths beyond which an unbound atom counts as lost (ours)."""
+BLOCK = 0.15
+"""Way of the fastest tone, in sites, during which an atom feels the same two tweezers."""
+BLOCK_S = 20e-6
+"""The longest time of that."""
+STEPS = 15.0
+"""Least number of steps of the integration in a period of the deepest tweezer."""
+LIT = 0.2
+"""Factor of the depth above which a tone counts as on when its tweezer is cut off; half the amplitude is a
+quarter. A ramp of 60 us is below it by then."""
+COLDEST = 0.1
+"""Least temperature after a flight over that before it: the energies of one atom scatter."""
 
 
-class Beams(NamedTuple):
-    """Waists and Rayleigh lengths of the static tweezers and of the mobile ones."""
-
-    static_waist: float
-    static_rayleigh: float
-    mobile_waist: float
-    mobile_rayleigh: float
-
-
-class Site(NamedTuple):
-    """The site nearest to an atom: its place in metres, and its depth."""
-
-    x: float
-    y: float
-    depth: float
-
-
-class Spot(NamedTuple):
-    """A mobile tweezer from one frame to the next, in which all changes linearly.
+class Machine(NamedTuple):
+    """The constants of the machine and of a program.
 
     Attributes:
-        x: Its place at the first frame.
-        y: Likewise.
-        way_x: Its displacement until the next one.
-        way_y: Likewise.
-        depth: Its depth if both tones have their intended power.
-        row: Depth factor of its row tone.
-        row_change: Its change until the next frame.
-        col: Depth factor of its column tone.
-        col_change: Its change.
+        static_depth: Nominal depth of a static tweezer.
+        static_waist: 1/e^2 radius of its intensity, in metres.
+        static_rayleigh: Its Rayleigh length.
+        mobile_depth: Depth of a mobile tweezer whose tones have their intended power.
+        mobile_waist: Its radius.
+        mobile_rayleigh: Its Rayleigh length.
+        temperature: Of cooled atoms, in kelvin.
+        cooling_hz: Rate at which the cooling light brings atoms back to it; 0 without light.
+        noise_hz: Rate at which noise of the intensity heats an atom in a nominal static tweezer.
+        loss: Probability that an atom which was moved is lost, beyond what its flight loses.
+        pair_survival: Probability that of two atoms in one tweezer one is left.
     """
 
-    x: float
-    y: float
-    way_x: float
-    way_y: float
-    depth: float
-    row: float
-    row_change: float
-    col: float
-    col_change: float
+    static_depth: float
+    static_waist: float
+    static_rayleigh: float
+    mobile_depth: float
+    mobile_waist: float
+    mobile_rayleigh: float
+    temperature: float
+    cooling_hz: float
+    noise_hz: float
+    loss: float
+    pair_survival: float
+
+
+MACHINE: Final = f"UniTuple(float64, {len(Machine._fields)})"
+KEPT, HAND_OVER, TRANSPORT, COLLISION, EJECTED, PROGRAM, FLYING, SETTLED = range(8)
+"""Places in ``FATES``; the last two only on the way: a settled atom is bound by its static tweezer alone, and
+is not moved until a mobile one comes near."""
 
 
 class Flight:
-    """What is recorded of an atom; nan where it did not happen.
+    """An atom near which a mobile tweezer comes; nan where it did not happen.
 
     Attributes:
+        fate: What became of it.
+        from_row: Row of its site before.
+        from_col: Column of it.
+        to_row: Row of the nearest site afterwards.
+        to_col: Column of it.
         held_s: When a mobile tweezer first held it.
         offset: How far that tweezer was from the nearest site, in metres.
         depth: Greatest depth of the tweezer.
         lost_s: When the atom was lost.
         lost_row: Where, in sites.
         lost_col: Likewise.
-        collided: Whether it collided, 1 or 0.
+        heat: Its temperature before, as it would be in a static tweezer of nominal depth.
+        energy: Its energy at the start, above the bottom, divided by the root of its site's relative depth.
+        glow_s: Sum over the time in mobile tweezers, relative to the nominal static depth.
+        row: Track of the row tone of its tweezer; -1: no tweezer is near.
+        col: Track of the column tone.
+        until_s: When a tweezer last held it.
+        cut_s: When this tweezer was cut off; inf: it was not.
     """
 
+    fate: int
+    from_row: int
+    from_col: int
+    to_row: int
+    to_col: int
     held_s: float
     offset: float
     depth: float
     lost_s: float
     lost_row: float
     lost_col: float
-    collided: float
+    heat: float
+    energy: float
+    glow_s: float
+    row: int
+    col: int
+    until_s: float
+    cut_s: float
 
 
 FLIGHT: Final = record(Flight)
-
-
-def new_flights(n_atoms: int) -> Records:
-    """Records of atoms of which nothing has happened yet (n_atoms,)."""
-    return np.full((n_atoms, len(FLIGHT.names or ())), np.nan).view(FLIGHT)[:, 0]
 
 
 @helper_kernel()
@@ -131,15 +171,176 @@ def pull(
     return radial * x, radial * y, axial * z, -energy
 
 
-@kernel(f"float64[::1]({TABLE}, {TABLE}, {VECTOR}, float64, float64)")
-def energies(state: Floats, sites: Floats, depth: Floats, waist: float, rayleigh: float) -> Floats:
-    """Energies of atoms (n_atoms, 6), each in its own beam at ``sites`` (n_atoms, 2), per mass."""
-    found = np.empty(len(state))
+@helper_kernel()
+def energy_in(atom: Floats, x: float, y: float, depth: float, waist: float, rayleigh: float) -> float:
+    """Energy of an atom in one tweezer at a place, negative if that binds it."""
+    kinetic = 0.5 * (atom[3] * atom[3] + atom[4] * atom[4] + atom[5] * atom[5])
+    return kinetic + pull(atom[0] - x, atom[1] - y, atom[2], depth, waist, rayleigh)[3]
+
+
+LANES: Final = 8
+"""Atoms that are moved together: those of a vector of 256 bits."""
+N_NUMBERS: Final = 15
+X, Y, Z, VX, VY, VZ, STATIC, AWAY_X, AWAY_Y, WAY_X, WAY_Y, ROW, ROW_CHANGE, COL, COL_CHANGE = (
+    LANES * n for n in range(N_NUMBERS)
+)
+"""Where each number of the lanes begins: position relative to the static tweezer, velocity, its depth;
+the mobile tweezer's place relative to the static one and its displacement until the next frame, the factors
+of its depth, and their changes."""
+ZERO, HALF_, ONE, TWO, FARTHEST = (np.float32(x) for x in (0.0, 0.5, 1.0, 2.0, 40.0))
+SHORTER = np.float32(-1.0 / 32.0)
+C2, C3, C4, C5 = (np.float32(1.0 / math.factorial(n)) for n in range(2, 6))
+
+
+@helper_kernel()
+def fall(q: np.float32) -> np.float32:
+    """exp(-q) for q of at least 0, as (exp(-q / 32))^32 with a series: to 1e-5 at 8, without branches."""
+    u = min(q, FARTHEST) * SHORTER
+    e = ONE + u * (ONE + u * (C2 + u * (C3 + u * (C4 + u * C5))))
+    e *= e
+    e *= e
+    e *= e
+    e *= e
+    return e * e
+
+
+@helper_kernel()
+def pull_fast(
+    x: np.float32, y: np.float32, z: np.float32, depth: np.float32, width: np.float32, length: np.float32
+) -> tuple[np.float32, np.float32]:
+    """As ``pull``, in single precision: what x and y, and what z is multiplied with for the acceleration.
+
+    ``width`` is 2 / waist^2, ``length`` 1 / rayleigh^2.
+    """
+    g = ONE / (ONE + z * z * length)
+    q = (x * x + y * y) * width * g
+    energy = depth * g * fall(q)
+    return -TWO * width * g * energy, -TWO * energy * (ONE - q) * g * length
+
+
+@helper_kernel()
+def move(lanes: NDArray[np.float32], machine: Machine, duration_s: float, n_steps: int) -> None:
+    """Move the atoms of all lanes from one frame to the next, in which all light changes evenly: leapfrog."""
+    width_s, length_s = np.float32(2 / machine.static_waist**2), np.float32(1 / machine.static_rayleigh**2)
+    width_m, length_m = np.float32(2 / machine.mobile_waist**2), np.float32(1 / machine.mobile_rayleigh**2)
+    depth, dt = np.float32(machine.mobile_depth), np.float32(duration_s / n_steps)
+    half = HALF_ * dt
+    for step in range(n_steps):
+        part = np.float32((step + 0.5) / n_steps)
+        for i in range(LANES):
+            x = lanes[X + i] + half * lanes[VX + i]
+            y = lanes[Y + i] + half * lanes[VY + i]
+            z = lanes[Z + i] + half * lanes[VZ + i]
+            radial_s, axial_s = pull_fast(x, y, z, lanes[STATIC + i], width_s, length_s)
+            right = x - lanes[AWAY_X + i] - part * lanes[WAY_X + i]
+            up = y - lanes[AWAY_Y + i] - part * lanes[WAY_Y + i]
+            row = lanes[ROW + i] + part * lanes[ROW_CHANGE + i]
+            col = lanes[COL + i] + part * lanes[COL_CHANGE + i]
+            radial_m, axial_m = pull_fast(right, up, z, depth * row * col, width_m, length_m)
+            vx = lanes[VX + i] + dt * (radial_s * x + radial_m * right)
+            vy = lanes[VY + i] + dt * (radial_s * y + radial_m * up)
+            vz = lanes[VZ + i] + dt * (axial_s + axial_m) * z
+            lanes[VX + i], lanes[VY + i], lanes[VZ + i] = vx, vy, vz
+            lanes[X + i] = x + half * vx
+            lanes[Y + i] = y + half * vy
+            lanes[Z + i] = z + half * vz
+
+
+WIDER = 2.2
+"""Width of the proposed positions relative to a harmonic well's: covers a beam's weaker flanks."""
+LONGER = 4.0
+"""The same along the beam."""
+
+
+@helper_kernel()
+def draw_place(most: float, atom: Floats, rng: np.random.Generator) -> float:
+    """Draw a position in units of waist and Rayleigh length; returns -U / kT there. See ``draw_atoms``."""
+    across, along = WIDER / math.sqrt(4.0 * most), LONGER / math.sqrt(2.0 * most)
+    while True:
+        nx, ny, nz = rng.standard_normal(), rng.standard_normal(), rng.standard_normal()
+        x, y, z = across * nx, across * ny, along * nz
+        s = 1.0 + z * z
+        a = most / s * math.exp(-2.0 * (x * x + y * y) / s)
+        part = rng.random() / math.exp(a - most + 0.5 * (nx * nx + ny * ny + nz * nz))
+        if part < 1.0 and part < math.erf(math.sqrt(a)) - 2.0 * math.sqrt(a / math.pi) * math.exp(-a):
+            atom[0], atom[1], atom[2] = x, y, z
+            return a
+
+
+@helper_kernel()
+def draw_atom(
+    atom: Floats, depth: float, kt: float, waist: float, rayleigh: float, rng: np.random.Generator
+) -> None:
+    """Draw one atom at the origin, as :func:`draw_atoms` does; ``kt`` is per mass."""
+    kt = min(kt, 0.5 * depth)
+    bound = draw_place(depth / kt, atom, rng)
+    atom[0], atom[1], atom[2] = waist * atom[0], waist * atom[1], rayleigh * atom[2]
+    while True:
+        vx, vy, vz = rng.standard_normal(), rng.standard_normal(), rng.standard_normal()
+        if 0.5 * (vx * vx + vy * vy + vz * vz) < bound:
+            fast = math.sqrt(kt)
+            atom[3], atom[4], atom[5] = fast * vx, fast * vy, fast * vz
+            return
+
+
+@kernel(f"float64[:, ::1]({const('float64', 1)}, {const('float64', 1)}, float64, float64, npy_rng)")
+def draw_atoms(depth: Floats, kt: Floats, waist: float, rayleigh: float, rng: np.random.Generator) -> Floats:
+    """Draw atoms from the Boltzmann distribution in a Gaussian beam, restricted to bound atoms.
+
+    Positions have the density ``exp(a) P(a)``, where ``a = -U / kT`` and
+    ``P(a) = erf(sqrt(a)) - 2 sqrt(a / pi) exp(-a)`` is the fraction of the Maxwell distribution slow enough
+    to be bound there. They are drawn by rejection from a wider Gaussian. This distribution is stationary;
+    the harmonic one would breathe. In tweezers too shallow for the temperature, the temperature is half of
+    the depth: hotter atoms have evaporated.
+
+    Args:
+        depth: Depth of each atom's tweezer per mass, (n_atoms,), above 0.
+        kt: kT per mass of each atom.
+        waist: 1/e^2 radius of the intensity.
+        rayleigh: Rayleigh length.
+        rng: Random numbers.
+
+    Returns:
+        Positions relative to the tweezers' foci, and velocities, (n_atoms, 6).
+    """
+    atoms = np.empty((len(depth), 6))
+    for i in range(len(depth)):
+        draw_atom(atoms[i], depth[i], kt[i], waist, rayleigh, rng)
+    return atoms
+
+
+@kernel(f"float64[::1](float64[:, ::1], {const('float64', 1)}, float64, float64, float64, float64)")
+def ramp_atoms(
+    state: Floats, depth: Floats, end: float, duration_s: float, waist: float, rayleigh: float
+) -> Floats:
+    """Move atoms while the depth of their static tweezers changes evenly.
+
+    Args:
+        state: The atoms, each relative to its tweezer (n_atoms, 6); changed in place.
+        depth: Depth of each tweezer at the start (n_atoms,).
+        end: Depth at the end over that at the start.
+        duration_s: Duration of the ramp.
+        waist: 1/e^2 radius of the intensity.
+        rayleigh: Rayleigh length.
+
+    Returns:
+        Energies in the tweezers at the end (n_atoms,).
+    """
+    energy = np.empty(len(state))
     for i in range(len(state)):
         x, y, z, vx, vy, vz = state[i]
-        energy = pull(x - sites[i, 0], y - sites[i, 1], z, depth[i], waist, rayleigh)[3]
-        found[i] = energy + 0.5 * (vx * vx + vy * vy + vz * vz)
-    return found
+        period_s = math.pi * waist / math.sqrt(depth[i] * max(1.0, end))
+        n_steps = math.ceil(16.0 * duration_s / period_s)
+        dt = duration_s / max(n_steps, 1)
+        for step in range(n_steps):
+            x, y, z = x + 0.5 * dt * vx, y + 0.5 * dt * vy, z + 0.5 * dt * vz
+            now = depth[i] * (1.0 + (end - 1.0) * (step + 0.5) / n_steps)
+            ax, ay, az, _ = pull(x, y, z, now, waist, rayleigh)
+            vx, vy, vz = vx + dt * ax, vy + dt * ay, vz + dt * az
+            x, y, z = x + 0.5 * dt * vx, y + 0.5 * dt * vy, z + 0.5 * dt * vz
+        state[i] = np.array([x, y, z, vx, vy, vz])
+        energy[i] = energy_in(state[i], 0.0, 0.0, end * depth[i], waist, rayleigh)
+    return energy
 
 
 @helper_kernel()
@@ -157,209 +358,506 @@ def place_of(row: float, col: float, plane: Floats) -> tuple[float, float]:
 
 
 @helper_kernel()
-def nearest(tracks: Floats, k: int, place: float) -> int:
-    """The tone nearest to a place, in sites, that is on at frame k or the next; -1 if none is."""
+def site_at(atom: Floats, plane: Floats, shape: tuple[int, int]) -> tuple[int, int, bool]:
+    """Row and column of the site nearest to an atom, and whether the atom is in the grid."""
+    at_row, at_col = sites_of(atom[0], atom[1], plane)
+    row, col = round(at_row), round(at_col)
+    inside = 0 <= row < shape[0] and 0 <= col < shape[1]
+    return min(max(row, 0), shape[0] - 1), min(max(col, 0), shape[1] - 1), inside
+
+
+@helper_kernel()
+def nearest(tones: Floats, k: int, last: int, place: float, guess: int) -> int:
+    """The track nearest to a place, in sites, at frame k or ``last``; -1 if none is on.
+
+    ``guess`` is taken if it is so close that no other can be closer.
+    """
+    if (
+        guess >= 0
+        and abs(tones[guess, k, PLACE] - place) < 0.2
+        and abs(tones[guess, last, PLACE] - place) < 0.2
+    ):
+        return guess
     best, least = -1, np.inf
-    for j in range(tracks.shape[1]):
-        for frame in (k, k + 1):
-            away = abs(tracks[frame, j] - place)
+    for j in range(len(tones)):
+        for frame in (k, last):
+            away = abs(tones[j, frame, PLACE] - place)
             if away < least:  # never for nan
                 best, least = j, away
     return best
 
 
 @helper_kernel()
-def course(tracks: Floats, depth: Floats, k: int, j: int) -> tuple[float, float, float, float]:
-    """Place of a tone at frame k and its depth factor, and how they change until the next frame.
-
-    A tone that is off at one of the two frames has depth 0 there, and does not move.
-    """
-    here, there = tracks[k, j], tracks[k + 1, j]
-    first, last = depth[k, j], depth[k + 1, j]
-    if math.isnan(here):
-        here, first = there, 0.0
-    if math.isnan(there):
-        there, last = here, 0.0
-    return here, there - here, first, last - first
-
-
-@helper_kernel()
-def find_spot(
-    atom: Floats, rows: Floats, row_depth: Floats, cols: Floats, col_depth: Floats, k: int, plane: Floats,
-    reach: float, depth: float,
-) -> Spot:  # fmt: skip
-    """The mobile tweezer nearest to an atom; of depth 0 if it stays beyond ``reach`` until the next frame."""
-    dark = Spot(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+def find_tweezer(
+    flight: Flight, atom: Floats, rows: Floats, cols: Floats, k: int, last: int, plane: Floats, reach: float
+) -> bool:
+    """Find the mobile tweezer nearest to an atom between two frames; whether one is near."""
     row, col = sites_of(atom[0], atom[1], plane)
-    i, j = nearest(rows, k, row), nearest(cols, k, col)
-    if i < 0 or j < 0:
-        return dark
-    row, down, row_factor, row_change = course(rows, row_depth, k, i)
-    col, right, col_factor, col_change = course(cols, col_depth, k, j)
+    flight.row = nearest(rows, k, last, row, flight.row)
+    flight.col = nearest(cols, k, last, col, flight.col)
+    if flight.row >= 0 and flight.col >= 0:
+        for frame in (k, last):
+            x, y = place_of(rows[flight.row, frame, PLACE], cols[flight.col, frame, PLACE], plane)
+            if square(x - atom[0], y - atom[1]) < reach * reach:  # never for nan
+                return True
+    flight.row = flight.col = -1
+    return False
+
+
+@helper_kernel()
+def relaxed(heat: float, elapsed_s: float, aim: float, machine: Machine) -> float:
+    """Temperature after a time in a static tweezer: cooled, or heated by the noise of the intensity."""
+    if machine.cooling_hz > 0.0:
+        return aim + (heat - aim) * math.exp(-elapsed_s * machine.cooling_hz)
+    return heat * math.exp(min(elapsed_s * machine.noise_hz, 20.0))
+
+
+@helper_kernel()
+def wake(
+    flight: Flight, atom: Floats, row: int, col: int, site: Site, now_s: float, plane: Floats,
+    machine: Machine, rng: np.random.Generator,
+) -> None:  # fmt: skip
+    """Draw where the atom of a site is in its static tweezer, and how it moves, as a mobile tweezer comes."""
+    level = math.sqrt(site.depth / machine.static_depth)
+    flight.heat = relaxed(site.heat, max(0.0, now_s - site.since_s), machine.temperature / level, machine)
+    waist, rayleigh = machine.static_waist, machine.static_rayleigh
+    draw_atom(atom, site.depth, KELVIN * flight.heat * level, waist, rayleigh, rng)
+    flight.energy = (energy_in(atom, 0.0, 0.0, site.depth, waist, rayleigh) + site.depth) / level
     x, y = place_of(row, col, plane)
-    way_x, way_y = down * plane[1, 0] + right * plane[2, 0], down * plane[1, 1] + right * plane[2, 1]
-    to_x, to_y = atom[0] - x, atom[1] - y
-    if min(math.hypot(to_x, to_y), math.hypot(to_x - way_x, to_y - way_y)) >= reach:
-        return dark
-    return Spot(x, y, way_x, way_y, depth, row_factor, row_change, col_factor, col_change)
+    atom[0] += x
+    atom[1] += y
+    site.atom = False
+    flight.fate, flight.row, flight.col = FLYING, -1, -1
+    flight.from_row, flight.from_col, flight.to_row, flight.to_col = row, col, row, col
+    flight.held_s = flight.lost_s = flight.lost_row = flight.lost_col = flight.offset = np.nan
+    flight.depth = flight.glow_s = 0.0
+    flight.until_s, flight.cut_s = -np.inf, np.inf
 
 
 @helper_kernel()
-def move(atom: Floats, site: Site, spot: Spot, beams: Beams, duration: float, n_steps: int) -> None:
-    """Move an atom from one frame to the next, in a static tweezer and a mobile one: leapfrog."""
-    x, y, z, vx, vy, vz = atom
-    dt = duration / n_steps
-    for step in range(n_steps):
-        x += 0.5 * dt * vx
-        y += 0.5 * dt * vy
-        z += 0.5 * dt * vz
-        part = (step + 0.5) / n_steps
-        ax, ay, az, _ = pull(x - site.x, y - site.y, z, site.depth, beams.static_waist, beams.static_rayleigh)
-        mobile = spot.depth * (spot.row + part * spot.row_change) * (spot.col + part * spot.col_change)
-        if mobile > 0.0:
-            away_x, away_y = x - spot.x - part * spot.way_x, y - spot.y - part * spot.way_y
-            bx, by, bz, _ = pull(away_x, away_y, z, mobile, beams.mobile_waist, beams.mobile_rayleigh)
-            ax, ay, az = ax + bx, ay + by, az + bz
-        vx += dt * ax
-        vy += dt * ay
-        vz += dt * az
-        x += 0.5 * dt * vx
-        y += 0.5 * dt * vy
-        z += 0.5 * dt * vz
-    atom[0], atom[1], atom[2], atom[3], atom[4], atom[5] = x, y, z, vx, vy, vz
+def wake_around(
+    row: float, col: float, flights: Records, state: Floats, n: int, awake: Ints, block: int, sites: Records,
+    now_s: float, plane: Floats, machine: Machine, rng: np.random.Generator,
+) -> int:  # fmt: skip
+    """Wake the atoms on the sites around a mobile tweezer; returns the number of flights."""
+    x, y = place_of(row, col, plane)
+    reach = NEAR * machine.mobile_waist
+    for r in range(max(math.floor(row), 0), min(math.floor(row) + 2, sites.shape[0])):
+        for c in range(max(math.floor(col), 0), min(math.floor(col) + 2, sites.shape[1])):
+            site_x, site_y = place_of(r, c, plane)
+            if square(x - site_x, y - site_y) >= reach * reach or sites[r, c].depth <= 0.0:
+                continue
+            awake[r, c] = block
+            if sites[r, c].atom:
+                wake(flights[n], state[n], r, c, sites[r, c], now_s, plane, machine, rng)
+                n += 1
+    return n
 
 
 @helper_kernel()
-def check_bound(
-    atom: Floats, site: Site, spot: Spot, beams: Beams, flight: Flight, t_s: float
-) -> tuple[bool, float]:
-    """Whether an atom is still trapped at the end of a frame, and its energy; records when it is held.
+def wake_atoms(
+    rows: Floats, cols: Floats, k: int, last: int, flights: Records, state: Floats, n: int, awake: Ints,
+    sites: Records, now_s: float, plane: Floats, machine: Machine, rng: np.random.Generator,
+) -> int:  # fmt: skip
+    """Wake the atoms on all sites that mobile tweezers are near between two frames.
 
-    An unbound atom is lost once it is far from every tweezer or far from the plane.
+    Args:
+        rows: The row tones.
+        cols: The column tones.
+        k: First frame.
+        last: Last frame.
+        flights: Room for the atoms of all sites, of which the first n fly or have settled.
+        state: Likewise.
+        n: Their number.
+        awake: The last block in which a tweezer was near each site (n_rows, n_cols); changed in place.
+        sites: The sites; changed in place: atoms that are woken leave them.
+        now_s: Time of frame k.
+        plane: The plane of the sites.
+        machine: The constants.
+        rng: Random numbers of the shot.
+
+    Returns:
+        The number of flights.
     """
-    x, y, z = atom[0] - site.x, atom[1] - site.y, atom[2]
-    from_site = math.hypot(x, y)
-    energy = pull(x, y, z, site.depth, beams.static_waist, beams.static_rayleigh)[3]
-    energy += 0.5 * (atom[3] ** 2 + atom[4] ** 2 + atom[5] ** 2)
-    near = from_site < GONE * beams.static_waist
-    mobile = spot.depth * (spot.row + spot.row_change) * (spot.col + spot.col_change)
-    if mobile > 0.0:
-        x, y = atom[0] - spot.x - spot.way_x, atom[1] - spot.y - spot.way_y
-        energy += pull(x, y, z, mobile, beams.mobile_waist, beams.mobile_rayleigh)[3]
-        from_spot = math.hypot(x, y)
-        near = near or from_spot < GONE * beams.mobile_waist
-        if mobile > site.depth and from_spot < beams.mobile_waist:
-            record_hold(site, spot, mobile, flight, t_s)
-    return energy < 0.0 or (near and abs(z) < HIGH * beams.mobile_rayleigh), energy
+    for i in range(len(rows)):
+        for j in range(len(cols)):
+            for frame in (k, last):
+                row, col = rows[i, frame, PLACE], cols[j, frame, PLACE]
+                if (frame == k > 0) or math.isnan(row) or math.isnan(col):  # frame k was the last one before
+                    continue
+                n = wake_around(row, col, flights, state, n, awake, last, sites, now_s, plane, machine, rng)
+    return n
 
 
 @helper_kernel()
-def record_hold(site: Site, spot: Spot, depth: float, flight: Flight, t_s: float) -> None:
-    """Record that a mobile tweezer holds an atom."""
-    if math.isnan(flight.held_s):
-        flight.held_s, flight.depth = t_s, 0.0
-        flight.offset = math.hypot(spot.x + spot.way_x - site.x, spot.y + spot.way_y - site.y)
-    flight.depth = max(flight.depth, depth)
+def must_move(
+    flight: Flight, atom: Floats, rows: Floats, cols: Floats, k: int, last: int, awake: Ints, sites: Records,
+    plane: Floats, machine: Machine,
+) -> bool:  # fmt: skip
+    """Whether an atom must be integrated from frame k to ``last``; one that need not settles."""
+    if flight.fate < FLYING or (flight.fate == SETTLED and awake[flight.to_row, flight.to_col] < last):
+        return False
+    if find_tweezer(flight, atom, rows, cols, k, last, plane, NEAR * machine.mobile_waist):
+        flight.fate = FLYING
+        return True
+    row, col, _ = site_at(atom, plane, sites.shape)
+    x, y = place_of(row, col, plane)
+    depth = sites[row, col].depth
+    if energy_in(atom, x, y, depth, machine.static_waist, machine.static_rayleigh) >= 0.0:
+        return True
+    flight.fate, flight.to_row, flight.to_col = SETTLED, row, col
+    return False
 
 
 @helper_kernel()
-def record_loss(atom: Floats, plane: Floats, flight: Flight, t_s: float, collided: float) -> None:
-    """Record when and where an atom was lost, and whether in a collision."""
-    flight.lost_s, flight.collided = t_s, collided
+def set_tweezer(
+    lanes: NDArray[np.float32], i: int, flight: Flight, rows: Floats, cols: Floats, k: int, x: float,
+    y: float, plane: Floats,
+) -> None:  # fmt: skip
+    """Fill in the mobile tweezer of lane i from frame k to the next, relative to (x, y)."""
+    if flight.row < 0:
+        return  # its depth is 0
+    row, col = rows[flight.row, k], cols[flight.col, k]
+    lanes[ROW + i], lanes[ROW_CHANGE + i] = row[DEPTH], row[CHANGE]
+    lanes[COL + i], lanes[COL_CHANGE + i] = col[DEPTH], col[CHANGE]
+    if math.isnan(row[PLACE]) or math.isnan(col[PLACE]):
+        return  # likewise
+    at_x, at_y = place_of(row[PLACE], col[PLACE], plane)
+    lanes[AWAY_X + i], lanes[AWAY_Y + i] = at_x - x, at_y - y
+    lanes[WAY_X + i] = row[WAY] * plane[1, 0] + col[WAY] * plane[2, 0]
+    lanes[WAY_Y + i] = row[WAY] * plane[1, 1] + col[WAY] * plane[2, 1]
+
+
+@helper_kernel()
+def move_some(
+    lanes: NDArray[np.float32], origin: Floats, moving: Ints, state: Floats, flights: Records, rows: Floats,
+    cols: Floats, k: int, last: int, n_steps: int, sites: Records, frame_s: float, plane: Floats,
+    machine: Machine,
+) -> None:  # fmt: skip
+    """Move as many atoms as there are lanes, or fewer, from frame k to ``last``."""
+    lanes[:] = ZERO
+    for i in range(len(moving)):
+        atom = state[moving[i]]
+        row, col, _ = site_at(atom, plane, sites.shape)
+        origin[i, 0], origin[i, 1] = place_of(row, col, plane)
+        lanes[STATIC + i] = sites[row, col].depth
+        lanes[X + i], lanes[Y + i], lanes[Z + i] = atom[0] - origin[i, 0], atom[1] - origin[i, 1], atom[2]
+        lanes[VX + i], lanes[VY + i], lanes[VZ + i] = atom[3], atom[4], atom[5]
+    for frame in range(k, last):
+        for i in range(len(moving)):
+            flight = flights[moving[i]]
+            set_tweezer(lanes, i, flight, rows, cols, frame, origin[i, 0], origin[i, 1], plane)
+        move(lanes, machine, frame_s, n_steps)
+    for i in range(len(moving)):
+        atom = state[moving[i]]
+        atom[0], atom[1], atom[2] = origin[i, 0] + lanes[X + i], origin[i, 1] + lanes[Y + i], lanes[Z + i]
+        atom[3], atom[4], atom[5] = lanes[VX + i], lanes[VY + i], lanes[VZ + i]
+
+
+@helper_kernel()
+def lose(flight: Flight, fate: int, atom: Floats, plane: Floats, t_s: float) -> None:
+    """Record when, where and by what an atom was lost."""
+    flight.fate, flight.lost_s = fate, t_s
     flight.lost_row, flight.lost_col = sites_of(atom[0], atom[1], plane)
 
 
 @helper_kernel()
-def find_site(atom: Floats, plane: Floats, static_depth: Floats) -> Site:
-    """The site nearest to an atom."""
-    at_row, at_col = sites_of(atom[0], atom[1], plane)
-    row = min(max(round(at_row), 0), static_depth.shape[0] - 1)
-    col = min(max(round(at_col), 0), static_depth.shape[1] - 1)
+def fall_out(flight: Flight, atom: Floats, plane: Floats, shape: tuple[int, int], t_s: float) -> None:
+    """Lose an atom that no tweezer binds, and say by what."""
+    inside = site_at(atom, plane, shape)[2]
+    fate = PROGRAM if flight.until_s > flight.cut_s - 1.5 * BLOCK_S else TRANSPORT
+    lose(flight, fate if inside else EJECTED, atom, plane, t_s)
+
+
+@helper_kernel()
+def check_atom(
+    flight: Flight, atom: Floats, rows: Floats, cols: Floats, k: int, sites: Records, t_s: float,
+    lasted_s: float, plane: Floats, machine: Machine,
+) -> None:  # fmt: skip
+    """See what holds an atom at frame k; it is lost once it is unbound and far from everything."""
+    row, col, _ = site_at(atom, plane, sites.shape)
     x, y = place_of(row, col, plane)
-    return Site(x, y, static_depth[row, col])
+    depth, mobile, to_x, to_y = sites[row, col].depth, 0.0, 0.0, 0.0
+    near = square(atom[0] - x, atom[1] - y) < (GONE * machine.static_waist) ** 2
+    if flight.row >= 0:
+        row_tone, col_tone = rows[flight.row, k - 1], cols[flight.col, k - 1]
+        factor = (row_tone[DEPTH] + row_tone[CHANGE]) * (col_tone[DEPTH] + col_tone[CHANGE])
+        if factor > 0.0:
+            mobile = machine.mobile_depth * factor
+            at_x, at_y = place_of(row_tone[PLACE] + row_tone[WAY], col_tone[PLACE] + col_tone[WAY], plane)
+            to_x, to_y = atom[0] - at_x, atom[1] - at_y
+            away = square(to_x, to_y)
+            near = near or away < (GONE * machine.mobile_waist) ** 2
+            if mobile > depth and away < machine.mobile_waist**2:
+                record_hold(flight, math.sqrt(square(at_x - x, at_y - y)), mobile, t_s)
+                flight.glow_s += lasted_s * mobile / machine.static_depth
+    if near and abs(atom[2]) < HIGH * machine.mobile_rayleigh:
+        return
+    energy = energy_in(atom, x, y, depth, machine.static_waist, machine.static_rayleigh)
+    energy += pull(to_x, to_y, atom[2], mobile, machine.mobile_waist, machine.mobile_rayleigh)[3]
+    if energy >= 0.0:
+        fall_out(flight, atom, plane, sites.shape, t_s)
+
+
+@helper_kernel()
+def square(x: float, y: float) -> float:
+    """Square of the length of a vector."""
+    return x * x + y * y
+
+
+@helper_kernel()
+def record_hold(flight: Flight, offset: float, depth: float, t_s: float) -> None:
+    """Record that a mobile tweezer holds an atom."""
+    if math.isnan(flight.held_s):
+        flight.held_s, flight.offset = t_s, offset
+    flight.depth = max(flight.depth, depth)
+    flight.until_s = t_s
+
+
+@helper_kernel()
+def check_faults(
+    flight: Flight, atom: Floats, rows: Floats, row_faults: Ints, cols: Floats, col_faults: Ints, k: int,
+    start_s: float, frame_s: float, plane: Floats,
+) -> None:  # fmt: skip
+    """Note when the tweezer that holds an atom at frame k is cut off; lose an atom whose tones mix.
+
+    A tone may be cut off when the other one has gone down in a ramp: then the tweezer was off before.
+    """
+    now_s = start_s + k * frame_s
+    if flight.fate != FLYING or flight.until_s != now_s:
+        return
+    cut = min(row_faults[flight.row, CUT], col_faults[flight.col, CUT])
+    is_lit = cut < NEVER and min(rows[flight.row, cut, DEPTH], cols[flight.col, cut, DEPTH]) > LIT
+    flight.cut_s = start_s + cut * frame_s if is_lit else np.inf
+    if k >= min(row_faults[flight.row, MIXED], col_faults[flight.col, MIXED]):
+        lose(flight, COLLISION, atom, plane, now_s)
 
 
 @helper_kernel()
 def collide(
-    state: Floats, alive: NDArray[np.bool_], moving: NDArray[np.bool_], flights: Records, plane: Floats,
-    within: float, luck: Floats, pair_survival: float, t_s: float,
+    state: Floats, moving: Ints, flights: Records, plane: Floats, machine: Machine, t_s: float,
+    rng: np.random.Generator,
 ) -> None:  # fmt: skip
-    """Of two moving atoms that are closer than ``within``, collisions in the light leave one or none."""
-    for i in range(len(alive)):
-        for j in range(i):
-            if not (moving[i] and moving[j] and alive[i] and alive[j]):
+    """Of two moving atoms within a waist of each other, collisions in the light leave one or none."""
+    for m in range(len(moving)):
+        for n in range(m):
+            i, j = moving[m], moving[n]
+            x, y = state[i, 0] - state[j, 0], state[i, 1] - state[j, 1]
+            if square(x, y) > machine.mobile_waist**2:
                 continue
-            if math.hypot(state[i, 0] - state[j, 0], state[i, 1] - state[j, 1]) < within:
-                one_left = luck[i] < pair_survival
-                alive[i], alive[j] = one_left and luck[j] < 0.5, one_left and luck[j] >= 0.5
-                for atom in (i, j):
-                    if not alive[atom]:
-                        record_loss(state[atom], plane, flights[atom], t_s, 1.0)
+            if flights[i].fate != FLYING or flights[j].fate != FLYING:
+                continue
+            one_left, first = rng.random() < machine.pair_survival, rng.random() < 0.5
+            for atom, stays in ((i, one_left and first), (j, one_left and not first)):
+                if not stays:
+                    lose(flights[atom], COLLISION, state[atom], plane, t_s)
+
+
+@helper_kernel()
+def ways_of(rows: Floats, cols: Floats) -> Floats:
+    """Way of the fastest tone from each frame to the next, in sites (n_frames,)."""
+    ways = np.zeros(rows.shape[1])
+    for axis in (rows, cols):
+        for j in range(len(axis)):
+            for k in range(axis.shape[1]):
+                ways[k] = max(ways[k], abs(axis[j, k, WAY]))  # never nan
+    return ways
+
+
+@helper_kernel()
+def greatest(tones: Floats) -> float:
+    """The greatest factor of the depth of any tone."""
+    most = 0.0
+    for j in range(len(tones)):
+        for k in range(tones.shape[1]):
+            most = max(most, tones[j, k, DEPTH])
+    return most
+
+
+@helper_kernel()
+def steps_of(machine: Machine, factor: float, frame_s: float) -> int:
+    """Steps from frame to frame; ``factor``: that of the depth of the deepest tweezer."""
+    depth, waist = machine.static_depth + factor * machine.mobile_depth, machine.mobile_waist
+    return math.ceil(STEPS * frame_s * math.sqrt(depth) / (math.pi * waist))
+
+
+@helper_kernel()
+def end_of_block(k: int, ways: Floats, longest: int) -> int:
+    """The last frame of the block that begins with frame k."""
+    way, last = ways[k], k + 1
+    while last < min(k + longest, len(ways) - 1) and way + ways[last] <= BLOCK:
+        way += ways[last]
+        last += 1
+    return last
+
+
+@helper_kernel()
+def land(
+    flight: Flight, atom: Floats, sites: Records, plane: Floats, machine: Machine, end_s: float,
+    rng: np.random.Generator,
+) -> None:  # fmt: skip
+    """Decide the fate of an atom that is left at the end: its nearest site keeps it, if it binds it."""
+    row, col, inside = site_at(atom, plane, sites.shape)
+    x, y = place_of(row, col, plane)
+    depth = sites[row, col].depth
+    energy = energy_in(atom, x, y, depth, machine.static_waist, machine.static_rayleigh)
+    is_held = not math.isnan(flight.held_s)
+    if not inside or energy >= 0.0:
+        fall_out(flight, atom, plane, sites.shape, end_s)
+    elif is_held and rng.random() < machine.loss:
+        lose(flight, HAND_OVER, atom, plane, end_s)
+    else:
+        flight.fate, flight.to_row, flight.to_col = KEPT, row, col
+        change = (energy + depth) / math.sqrt(depth / machine.static_depth) - flight.energy
+        flight.heat = max(flight.heat + change / 3.0 / KELVIN, COLDEST * flight.heat)
+        if machine.cooling_hz == 0.0:
+            flight.heat *= math.exp(min(flight.glow_s * machine.noise_hz, 20.0))
+
+
+@helper_kernel()
+def put_down(
+    flights: Records, state: Floats, sites: Records, plane: Floats, end_s: float, lost: Ints
+) -> None:
+    """Put the atoms on their sites, two on one are lost, and count the losses."""
+    for i in range(len(flights)):
+        for j in range(i if flights[i].fate == KEPT else 0):
+            a, b = flights[i], flights[j]
+            if b.fate == KEPT and a.to_row == b.to_row and a.to_col == b.to_col:
+                lose(a, COLLISION, state[i], plane, end_s)
+                lose(b, COLLISION, state[j], plane, end_s)
+                break
+    for flight in flights:
+        if flight.fate == KEPT:
+            site = sites[flight.to_row, flight.to_col]
+            site.atom, site.heat, site.since_s = True, flight.heat, end_s
+        lost[flight.fate] += 1
+
+
+TABLE, OFFSETS = const("float64", 2), const("int32", 1)
+TONES, SITES = const(signature(TONE), 1), f"Array({signature(SITE)}, 2, 'C')"
+FLIGHTS = f"Array({signature(FLIGHT)}, 1, 'C')"
+COURSES, FAULTS, SHOT = const("float64", 3), const("int64", 2), f"{MACHINE}, {TABLE}, npy_rng, int64[::1]"
+
+
+@helper_kernel(f"{FLIGHTS}({SITES}, {COURSES}, {FAULTS}, {COURSES}, {FAULTS}, float64, float64, {SHOT})")
+def fly(
+    sites: Records, rows: Floats, row_faults: Ints, cols: Floats, col_faults: Ints, start_s: float,
+    frame_s: float, numbers: tuple[float, ...], plane: Floats, rng: np.random.Generator, lost: Ints,
+) -> Records:  # fmt: skip
+    """Move the atoms in the light of a batch.
+
+    Between frames, positions and depths change evenly. An atom feels its nearest static tweezer and its
+    nearest mobile one. One that its static tweezer binds is not moved while no mobile one is near.
+
+    Args:
+        sites: The sites and their atoms; changed in place.
+        rows: The row tones.
+        row_faults: Their faults, see ``CUT`` (n_row_tones, 2).
+        cols: The column tones.
+        col_faults: Their faults.
+        start_s: Time of the first frame.
+        frame_s: Time from frame to frame.
+        numbers: The numbers of :class:`Machine`.
+        plane: The plane of the sites.
+        rng: Random numbers of the shot.
+        lost: Number of atoms of each of ``FATES`` (6,); changed in place.
+
+    Returns:
+        What happened to the atoms that tweezers came near (n_atoms,).
+    """
+    machine = Machine(*numbers)
+    flights: Records = np.empty(sites.size, FLIGHT)
+    state, n = np.empty((sites.size, 6)), 0
+    moving, lanes = np.empty(sites.size, np.int64), np.empty(LANES * N_NUMBERS, np.float32)
+    origin, awake = np.empty((LANES, 2)), np.full(sites.shape, -1)
+    ways, k, end_s = ways_of(rows, cols), 0, start_s
+    n_steps = steps_of(machine, greatest(rows) * greatest(cols), frame_s)
+    while k < len(ways) - 1:
+        last, n_moving = end_of_block(k, ways, round(BLOCK_S / frame_s)), 0
+        now_s, end_s = end_s, start_s + last * frame_s
+        n = wake_atoms(rows, cols, k, last, flights, state, n, awake, sites, now_s, plane, machine, rng)
+        for i in range(n):
+            if must_move(flights[i], state[i], rows, cols, k, last, awake, sites, plane, machine):
+                moving[n_moving] = i
+                n_moving += 1
+        for m in range(0, n_moving, LANES):
+            some = moving[m : min(m + LANES, n_moving)]
+            move_some(
+                lanes,
+                origin,
+                some,
+                state,
+                flights,
+                rows,
+                cols,
+                k,
+                last,
+                n_steps,
+                sites,
+                frame_s,
+                plane,
+                machine,
+            )
+        for i in moving[:n_moving]:
+            check_atom(flights[i], state[i], rows, cols, last, sites, end_s, end_s - now_s, plane, machine)
+            check_faults(
+                flights[i], state[i], rows, row_faults, cols, col_faults, last, start_s, frame_s, plane
+            )
+        collide(state, moving[:n_moving], flights, plane, machine, end_s, rng)
+        k = last
+    for i in range(n):
+        if flights[i].fate >= FLYING:
+            land(flights[i], state[i], sites, plane, machine, end_s, rng)
+    put_down(flights[:n], state, sites, plane, end_s, lost)
+    return flights[:n]
+
+
+@kernel(f"{FLIGHTS}({SITES}, {TABLE}, {TABLE}, {TABLE}, {TABLE}, float64, float64, {SHOT})")
+def fly_in_light(
+    sites: Records, rows: Floats, row_depth: Floats, cols: Floats, col_depth: Floats, start_s: float,
+    frame_s: float, numbers: tuple[float, ...], plane: Floats, rng: np.random.Generator, lost: Ints,
+) -> Records:  # fmt: skip
+    """Move the atoms in the light of tones: places (sites) and depth factors (n_tracks, n_frames)."""
+    row_faults, col_faults = np.full((len(rows), 2), NEVER), np.full((len(cols), 2), NEVER)
+    of_rows, of_cols = course_of(rows, row_depth), course_of(cols, col_depth)
+    return fly(sites, of_rows, row_faults, of_cols, col_faults, start_s, frame_s, numbers, plane, rng, lost)
 
 
 @kernel(
-    f"void(float64[:, ::1], boolean[::1], Array({signature(FLIGHT)}, 1, 'C'), {TABLE}, {TABLE}, {TABLE}, "
-    f"{TABLE}, {VECTOR}, {TABLE}, float64, {TABLE}, {VECTOR}, int64, {VECTOR}, float64)"
+    f"void({SITES}, {TONES}, {OFFSETS}, {TONES}, {OFFSETS}, {const('float64', 1)}, {const('int8', 1)}, "
+    f"int64, UniTuple(float64, 2), float64, float64, {SHOT})"
 )
-def follow_atoms(
-    state: Floats,
-    alive: NDArray[np.bool_],
-    flights: Records,
-    rows: Floats,
-    row_depth: Floats,
-    cols: Floats,
-    col_depth: Floats,
-    t_s: Floats,
-    static_depth: Floats,
-    mobile_depth: float,
-    plane: Floats,
-    widths: Floats,
-    n_steps: int,
-    luck: Floats,
-    pair_survival: float,
-) -> None:
-    """Follow every atom from the first frame to the last.
-
-    Between frames, positions and depths change linearly. An atom feels its nearest static tweezer and its
-    nearest mobile one. An atom bound by its static tweezer is not moved while no mobile one is near. Of two
-    atoms that come within a waist of each other, collisions in the light leave one or none, at once.
+def fly_in_program(
+    sites: Records, rows: Records, row_offsets: NDArray[np.int32], cols: Records,
+    col_offsets: NDArray[np.int32], durations_s: Floats, courses: NDArray[np.int8], n_segments: int,
+    step_hz: tuple[float, float], start_s: float, frame_s: float, numbers: tuple[float, ...], plane: Floats,
+    rng: np.random.Generator, lost: Ints,
+) -> None:  # fmt: skip
+    """Move the atoms in the light of the first segments of a program, batch by batch.
 
     Args:
-        state: The atoms, (n_atoms, 6); changed in place.
-        alive: Which atoms are still trapped, (n_atoms,); changed in place.
-        flights: A record of each atom, see :func:`new_flights`; changed in place.
-        rows: Row tones, in sites (n_frames, n_tracks), nan where off.
-        row_depth: Their depth factors, likewise.
-        cols: Column tones, likewise.
-        col_depth: Likewise.
-        t_s: Times of the frames (n_frames,).
-        static_depth: Depths of the static tweezers (n_rows, n_cols).
-        mobile_depth: Depth of a mobile tweezer whose factors are 1.
+        sites: The sites and their atoms; changed in place.
+        rows: The row tones of all segments (n_tones,).
+        row_offsets: Where those of each segment begin.
+        cols: The column tones.
+        col_offsets: Likewise.
+        durations_s: Durations of the segments.
+        courses: Courses of their frequencies.
+        n_segments: Number of segments that are played.
+        step_hz: Difference of the frequencies of neighbouring rows, and columns.
+        start_s: When the program starts.
+        frame_s: Time from frame to frame.
+        numbers: The numbers of :class:`Machine`.
         plane: The plane of the sites.
-        widths: The numbers of :class:`Beams` (4,).
-        n_steps: Integration steps from frame to frame.
-        luck: A uniform random number for each atom (n_atoms,).
-        pair_survival: Probability that one of two atoms is left.
+        rng: Random numbers of the shot.
+        lost: Number of atoms of each of ``FATES`` (6,); changed in place.
     """
-    beams = Beams(widths[0], widths[1], widths[2], widths[3])
-    moving = np.zeros(len(alive), np.bool_)
-    for k in range(len(t_s) - 1):
-        for i in range(len(alive)):
-            moving[i] = False
-            if not alive[i]:
-                continue
-            atom, flight = state[i], flights[i]
-            site = find_site(atom, plane, static_depth)
-            spot = find_spot(
-                atom, rows, row_depth, cols, col_depth, k, plane, NEAR * beams.mobile_waist, mobile_depth
-            )
-            if spot.depth == 0.0:
-                there, energy = check_bound(atom, site, spot, beams, flight, t_s[k])
-                if there and energy < 0.0:
-                    continue
-            moving[i] = True
-            move(atom, site, spot, beams, t_s[k + 1] - t_s[k], n_steps)
-            alive[i], _ = check_bound(atom, site, spot, beams, flight, t_s[k + 1])
-            if not alive[i]:
-                record_loss(atom, plane, flight, t_s[k + 1], 0.0)
-        collide(state, alive, moving, flights, plane, beams.mobile_waist, luck, pair_survival, t_s[k + 1])
+    for first, last in find_batches(rows, row_offsets, cols, col_offsets, n_segments):
+        rows_now, row_faults = light_of_axis(
+            rows, row_offsets, durations_s, courses, first, last, frame_s, step_hz[0]
+        )
+        cols_now, col_faults = light_of_axis(
+            cols, col_offsets, durations_s, courses, first, last, frame_s, step_hz[1]
+        )
+        first_s = start_s + durations_s[:first].sum() - HALF * frame_s
+        fly(sites, rows_now, row_faults, cols_now, col_faults, first_s, frame_s, numbers, plane, rng, lost)

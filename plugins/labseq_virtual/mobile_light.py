@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from labseq.plugin import MotionSpec, RandomStream, SiteGrid, ToneProgram
 from labseq.plugin.simulation import RfSpan
-from labseq_virtual.handover import full_amplitudes, full_volts
+from labseq_virtual.formulas import full_amplitudes, full_volts
 from labseq_virtual.rf_analysis import bands, track_tones
 from labseq_virtual.settings import MobileLightSettings
 from labseq_virtual.tone_positions import TonePositions

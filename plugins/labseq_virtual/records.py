@@ -12,6 +12,9 @@ import numpy as np
 
 Dtype = np.dtype[Any]
 
+FATES: Final = ("kept", "hand_over", "transport", "collision", "ejected", "program")
+"""What may become of an atom that a mobile tweezer held: kept, or lost by one of these causes."""
+
 NUMBERS: Final[dict[Any, Any]] = {float: np.float64, int: np.int64, bool: np.bool_}
 
 
@@ -38,16 +41,12 @@ class Tone:
         end: At the end.
         power_start: Its power at the start, relative to the intended one.
         power_end: At the end.
-        on_start: Whether it is on at the start.
-        on_end: Whether it is on at the end.
     """
 
     start: float
     end: float
     power_start: float
     power_end: float
-    on_start: bool
-    on_end: bool
 
 
 class Site:
@@ -55,17 +54,15 @@ class Site:
 
     Attributes:
         atom: Whether there is one.
-        depth: Depth of the static tweezer, in kelvin.
+        depth: Depth of the static tweezer per mass, in m^2/s^2.
         heat: Temperature of the atom, as it would be at the nominal depth.
         since_s: The time that the temperature belongs to.
-        hazard: By tweezers that passed the atom: it stays with the probability ``exp(-hazard)``.
     """
 
     atom: bool
     depth: float
     heat: float
     since_s: float
-    hazard: float
 
 
 TONE: Final = record(Tone)

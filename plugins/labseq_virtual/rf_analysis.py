@@ -197,6 +197,11 @@ class Tracks:
     phase_rad: Floats
 
 
+def sites_in_transit(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> float:
+    """Greatest motion of a tweezer while the sound crosses the beam, in sites."""
+    return PEAK_SPEED[motion.speed_profile] * motion.speed_m_s * transit_s / grid.spacing_m
+
+
 def check_resolvable(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> None:
     """Check that :func:`track_tones` can resolve the tones; otherwise atoms would be lost in the analysis.
 
@@ -211,8 +216,7 @@ def check_resolvable(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> No
         step, least = (format_quantity(hz, "frequency") for hz in (step_hz, min_hz))
         quantity = f"the smallest step of the sites' tones at a transit_time of {transit}"
         raise LimitError(quantity, step, f"at least {least}: tones closer than that cannot be resolved", hint)
-    sites = PEAK_SPEED[motion.speed_profile] * motion.speed_m_s * transit_s / grid.spacing_m
-    if sites > MAX_SITES:
+    if (sites := sites_in_transit(grid, motion, transit_s)) > MAX_SITES:
         quantity = f"the motion of a mobile tweezer in a transit_time of {transit}"
         raise LimitError(
             quantity, f"{sites:.2g} sites", f"{MAX_SITES:g}: a faster chirp blurs the tones", hint

@@ -271,25 +271,6 @@ class MobileLightSettings(Settings):
         description="s.d. of the position error of each row's and each column's tone, fixed for a seed; "
         "likewise (ours)",
     )
-    depth_drop_per_tone: Fraction = Field(
-        default=0.0,
-        description="the depth is divided by 1 plus this for each tone on beyond one per axis (ours; the "
-        "paper observes a drop and gives no number). Not used for drivers that connect their outputs",
-    )
-    intermodulation: Fraction = Field(
-        default=0.02,
-        description="relative s.d. of the depths of 20 tweezers in a line; that of n is proportional to "
-        "the root of n - 1 (paper: 2 %; the scaling is ours)",
-    )
-    adiabatic_depth: NonNegativeTemperature = Field(
-        default=0.0,
-        description="smallest depth of a tweezer that carries its atom at 130 um/ms; it scales with the "
-        "speed squared (ours; the paper suspects such a depth, reached at 13 tweezers; 0: there is none). "
-        "Not used for drivers that connect their outputs, where the motion of the atoms is integrated",
-    )
-    shallow_loss: Fraction = Field(
-        default=0.0, description="loss in tweezers that are shallower than that (ours)"
-    )
 
 
 class LightSettings(Settings):
@@ -392,14 +373,8 @@ class SimulationSettings(Settings):
     )
     transport_loss: Fraction = Field(
         default=0.0188,
-        description="mean loss of an atom that is picked up, moved and dropped, at the nominal depths; it "
-        "is proportional to the ratio of mobile to static depth (derived: gives about the paper's filling of "
-        "97.66 % after one cycle at a degree of parallelism of 7; the scaling is ours)",
-    )
-    transport_loss_per_tone: Fraction = Field(
-        default=0.0,
-        description="added to it for each tone on beyond one per axis (ours; the paper observes more loss "
-        "with more tones and gives no number)",
+        description="mean loss of an atom that is moved, beside what its motion in the light loses (derived: "
+        "gives about the paper's filling of 97.66 % after one cycle at a degree of parallelism of 7)",
     )
     transport_loss_spread: NonNegativeFloat = Field(
         default=0.5,

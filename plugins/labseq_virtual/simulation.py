@@ -6,7 +6,6 @@ import importlib
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
@@ -26,22 +25,21 @@ from labseq.plugin import (
     Simulation,
     ToneProgram,
     TweezerAmplitudes,
+    format_quantity,
 )
 from labseq.plugin.simulation import WHOLE_SENSOR, RfSource, ToneSource
 from labseq_virtual.atoms import Atoms
-from labseq_virtual.flight import RfTransport
-from labseq_virtual.handover import noise_hz, recoil_heat
+from labseq_virtual.flight import Conditions, Flights, RunningProgram
+from labseq_virtual.formulas import noise_hz, recoil_heat
 from labseq_virtual.images import Exposure
 from labseq_virtual.lights import Lights
 from labseq_virtual.mobile_light import MobileLight, MobileTones, with_true_response
-from labseq_virtual.responses import beyond
-from labseq_virtual.rf_analysis import PulseReceiver
+from labseq_virtual.records import FATES
+from labseq_virtual.rf_analysis import MAX_SITES, PulseReceiver, sites_in_transit
 from labseq_virtual.sensors import View
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.static_array import StaticArray
 from labseq_virtual.tone_positions import TonePositions
-from labseq_virtual.transport import RunningProgram, Transport
-from labseq_virtual.tweezer_kernels import CAUSES
 from labseq_virtual.tweezer_view import TweezerView
 
 if TYPE_CHECKING:
@@ -64,10 +62,10 @@ class VirtualSimulation(Simulation):
     ended; playing a program without segments stops it early, and atoms in flight are lost. A ramp of the
     static tweezers that comes during a program or an exposure acts at its end.
 
-    Mobile tweezers work in one of two ways. A driver may pass its program, which is carried out as written
-    (``transport.py``). Or the driver connects its RF outputs: the simulation finds the tones in the samples
-    that were played and integrates the motion of the atoms in that light (``flight.py``). Static tweezers
-    likewise either pass their ramps, or connect outputs whose tones are measured.
+    Atoms fly in the light of the mobile tweezers (``flight.py``). Its tones are those of the program that a
+    driver passes, played exactly; or the driver connects its RF outputs, and the simulation finds the tones
+    in the samples that were played. Static tweezers likewise either pass their ramps, or connect outputs
+    whose tones are measured.
     """
 
     def __init__(self, settings: SimulationSettings, context: Context) -> None:
@@ -80,8 +78,7 @@ class VirtualSimulation(Simulation):
         self._seed = context.random.seed if settings.machine_seed is None else settings.machine_seed
         motion = with_true_response(context.grid, context.motion, settings.mobile_light, self._seed)
         self._motion = motion
-        self._transport = Transport(context.grid, motion, settings, self._positions)
-        self._flight = RfTransport(context.grid, motion, settings, self._positions)
+        self._flights = Flights(context.grid, motion, settings, self._positions)
         self._mobile_light = MobileLight(context.grid, motion, settings.mobile_light, self._positions)
         self._static = StaticArray(context.grid, settings)
         self._pulse_receiver: PulseReceiver | None = None
@@ -113,8 +110,15 @@ class VirtualSimulation(Simulation):
         self._exposure.prepare(mode)
 
     def warnings(self) -> list[str]:
-        """Settings beyond the range that the responses of the atoms were derived for."""
-        return beyond(self._motion, self._settings)
+        """A speed at which the light of the mobile tweezers is not known."""
+        transit_s = self._settings.mobile_light.transit_time
+        sites = sites_in_transit(self._grid, self._motion, transit_s)
+        if sites <= MAX_SITES:
+            return []
+        fastest = self._motion.speed_m_s * MAX_SITES / sites
+        came, last = (format_quantity(each, "speed") for each in (self._motion.speed_m_s, fastest))
+        what = f"profile.mobile_tweezers.speed is {came}; above {last} the sound's chirp blurs the tweezers"
+        return [f"{what}: that more atoms are lost is right, how many is not to be trusted"]
 
     @property
     def loading_probability(self) -> float:
@@ -131,7 +135,7 @@ class VirtualSimulation(Simulation):
 
     def warm(self) -> None:
         """Compile or load the kernels of tone finding and of transport."""
-        for kernels in ("rf_kernels", "flight_kernels", "transport_kernels"):
+        for kernels in ("rf_kernels", "flight_kernels"):
             importlib.import_module(f"labseq_virtual.{kernels}")
 
     def close(self) -> None:
@@ -149,7 +153,7 @@ class VirtualSimulation(Simulation):
         if self._pulse_receiver is not None:
             for _ in self._pulse_receiver.receive_until(self._clock.now()):
                 pass  # light before the shot acts on no atoms
-        self._flight.begin_shot()
+        self._flights.begin_shot()
         spread = self._settings.transport_loss_spread
         self._loss_factor = math.exp(spread * self._random.shot.standard_normal() - spread**2 / 2)
 
@@ -224,10 +228,10 @@ class VirtualSimulation(Simulation):
                 self._name,
                 f"'{role}' cannot connect outputs; expected 'mobile_tweezers' or 'static_tweezers'",
             )
-        self._flight.check_resolvable()
+        self._flights.check_resolvable()
         self._apply_output(self._clock.now())
         self._pulse_receiver = PulseReceiver(
-            cast("RfSource", source), 2 * self._flight.margin_s, self._flight.reach_hz
+            cast("RfSource", source), 2 * self._flights.margin_s, self._flights.reach_hz
         )
 
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
@@ -263,7 +267,7 @@ class VirtualSimulation(Simulation):
         """Atoms lost since the shot began, by cause."""
         return {
             cause: self._lost[cause]
-            for cause in ("vacuum", "imaging", "light", "release", "push_out", "heat", *CAUSES)
+            for cause in ("vacuum", "imaging", "light", "release", "push_out", "heat", *FATES[1:])
         }
 
     def spot_powers(self) -> NDArray[np.float64]:
@@ -301,7 +305,7 @@ class VirtualSimulation(Simulation):
         if self._pulse_receiver is None:
             return {}
         self._apply_output(self._clock.now())
-        return self._flight.tables(since_s)
+        return self._flights.tables(since_s)
 
     def describe(self) -> Mapping[str, Any]:
         """Every constant of the model, in SI, and the seed of its disorder."""
@@ -364,13 +368,9 @@ class VirtualSimulation(Simulation):
         if self._playing is None:
             return
         playing, self._playing, self._qubits = self._playing, None, None
-        n_played = playing.n_segments_until(until_s + ROUNDING_S)
-        start_s, end_s = playing.t_start_s, min(playing.t_end_s, until_s)
-        cooled, factor = self._cooling(start_s, end_s)
+        conditions = self._conditions(playing.t_start_s, min(playing.t_end_s, until_s))
         depth, rng = self._static.depth, self._random.shot
-        self._lost += self._transport.carry(
-            self._atoms, playing.program, n_played, depth, rng, factor, start_s, cooled
-        )
+        self._lost += self._flights.carry_program(self._atoms, playing, depth, rng, conditions, until_s)
         self._lose_to_vacuum(max(playing.t_start_s, min(playing.t_end_s, until_s)))
 
     def _apply_output(self, until_s: float) -> None:
@@ -381,19 +381,17 @@ class VirtualSimulation(Simulation):
                 raise DeviceError(self._name, f"{text}; wait (mobile_tweezers.wait, camera.read) first")
             self._lose_to_vacuum(pulse.start_s)
             self._qubits = None
-            cooled, factor = self._cooling(pulse.start_s, pulse.end_s)
+            conditions = self._conditions(pulse.start_s, pulse.end_s)
             depth, rng = self._static.depth, self._random.shot
             if self._atoms.occupied.any():
-                relax = partial(self._relaxed, cooled=cooled)
-                pairs = None if cooled > 0 else 0.0
-                self._lost += self._flight.carry(self._atoms, pulse, depth, rng, factor, relax, pairs)
+                self._lost += self._flights.carry_pulse(self._atoms, pulse, depth, rng, conditions)
             self._lose_to_vacuum(pulse.end_s)
         self._lost += self._static.receive_until(until_s, self._atoms, self._random.shot)
 
-    def _cooling(self, start_s: float, end_s: float) -> tuple[float, float]:
-        """Fraction of the time with cooling light, and the factor on the transport loss: more without it."""
+    def _conditions(self, start_s: float, end_s: float) -> Conditions:
+        """Cooling light between two times, and the factor on the transport loss: more without that light."""
         cooled = self._lights.fraction_on("cooling", start_s, end_s)
-        return cooled, self._loss_factor * (cooled + (1.0 - cooled) * UNCOOLED)
+        return Conditions(self._loss_factor * (cooled + (1.0 - cooled) * UNCOOLED), cooled)
 
     def _begin_event(self, t_s: float, what: str) -> None:
         """Simulate everything before an event; refuse one that comes before the end of another."""

@@ -11,13 +11,17 @@ from numpy.typing import NDArray
 from labseq.plugin import DepthRamp, SiteGrid, TweezerAmplitudes
 from labseq.plugin.simulation import ToneSource
 from labseq_virtual.atoms import Atoms
-from labseq_virtual.flight import KELVIN, draw_atoms
-from labseq_virtual.responses import lowering
+from labseq_virtual.formulas import KELVIN, rayleigh_length
 from labseq_virtual.settings import SimulationSettings
 
 Floats = NDArray[np.float64]
+Sites = NDArray[np.intp]
 
 
+SLOWEST_S: Final = 10e-3
+"""Longest ramp that is simulated: 90 periods along the beam at 300 uK; slower ones are as gentle (ours)."""
+OFF: Final = 5e-3
+"""Depth over that before a ramp below which nothing stays: gravity, left out here, empties it (ours)."""
 HOLDING: Final = 0.1
 """Depth, as a fraction of the nominal one, below which a static tweezer loads no atom, and loses its own if
 it came there without a ramp (ours)."""
@@ -118,38 +122,62 @@ class StaticArray:
         Returns:
             Number of atoms lost.
         """
-        settings, heat = self._settings, atoms.heat
         row, col = np.nonzero(atoms.occupied & (self.depth > 0))
-        level = self.depth[row, col]
-        depth = KELVIN * settings.static_depth * level
-        waist = settings.static_waist
-        rayleigh = np.pi * waist**2 / settings.static_wavelength
-        state = draw_atoms(depth, KELVIN * heat[row, col] * np.sqrt(level), waist, rayleigh, rng)
+        state, depth, level = self._draw(atoms, row, col, rng)
+        waist, rayleigh = self._beam
         x, y, z = (state[:, :3] + dark_s * state[:, 3:]).T
         width = 1 + (z / rayleigh) ** 2
         light = depth / width * np.exp(-2 * (x**2 + y**2) / (waist**2 * width))
         kinetic = 0.5 * (state[:, 3:] ** 2).sum(axis=1)
         bound = kinetic < light
         atoms.occupied[row, col] = bound
-        heat[row, col] = np.maximum(kinetic + depth - light, 0.0) / 3 / KELVIN / np.sqrt(level)
+        atoms.heat[row, col] = np.maximum(kinetic + depth - light, 0.0) / 3 / KELVIN / np.sqrt(level)
         return int(np.count_nonzero(~bound))
 
     def ramp(self, ramp: DepthRamp, atoms: Atoms, rng: np.random.Generator) -> int:
         """Change the depth; atoms too hot for tweezers that become shallower are lost; returns how many."""
-        occupied, heat = atoms.occupied, atoms.heat
-        before = np.count_nonzero(occupied)
+        before = np.count_nonzero(atoms.occupied)
         for start, end, duration_s in (
             (self._level, ramp.start, 0.0),
             (ramp.start, ramp.end, ramp.duration_s),
         ):
             self._level = start
-            row, col = np.nonzero(occupied)
-            level = self.depth[row, col]
+            if end < start:
+                self._lower(end / start, duration_s, atoms, rng)
             self._level = end
-            if end < start and len(row):
-                temperature = heat[row, col] * np.sqrt(level)
-                depth = np.maximum(self._settings.static_depth * level, 1e-12)
-                loss, warmer = lowering(end / start, duration_s, depth, temperature)
-                occupied[row, col] = (rng.random(len(row)) >= loss) & (level > 0)
-                heat[row, col] *= warmer
-        return int(before - np.count_nonzero(occupied))
+        return int(before - np.count_nonzero(atoms.occupied))
+
+    def _lower(self, fraction: float, duration_s: float, atoms: Atoms, rng: np.random.Generator) -> None:
+        """Let atoms fly while their tweezers become shallower; those that are unbound at the end are lost."""
+        from labseq_virtual.flight_kernels import COLDEST, ramp_atoms
+
+        atoms.occupied &= (self.depth > 0) & (fraction > OFF)
+        row, col = np.nonzero(atoms.occupied)
+        state, depth, level = self._draw(atoms, row, col, rng)
+        before = ramp_atoms(state, depth, 1.0, 0.0, *self._beam) + depth
+        after = ramp_atoms(state, depth, fraction, min(duration_s, SLOWEST_S), *self._beam)
+        atoms.occupied[row, col] = after < 0
+        # the energy goes as the trap frequency if the change is slow
+        change = (after + fraction * depth) / np.sqrt(max(fraction, 1e-12)) - before
+        heat = atoms.heat[row, col]
+        atoms.heat[row, col] = np.maximum(heat + change / 3 / KELVIN / np.sqrt(level), COLDEST * heat)
+
+    @property
+    def _beam(self) -> tuple[float, float]:
+        """Waist and Rayleigh length."""
+        waist = self._settings.static_waist
+        return waist, rayleigh_length(waist, self._settings.static_wavelength)
+
+    def _draw(
+        self, atoms: Atoms, row: Sites, col: Sites, rng: np.random.Generator
+    ) -> tuple[Floats, Floats, Floats]:
+        """Draw atoms in their tweezers; also returns the depths per mass, and relative to the nominal one."""
+        from labseq_virtual.flight_kernels import draw_atoms
+
+        level = self.depth[row, col]
+        depth = KELVIN * self._settings.static_depth * level
+        return (
+            draw_atoms(depth, KELVIN * atoms.heat[row, col] * np.sqrt(level), *self._beam, rng),
+            depth,
+            level,
+        )

@@ -126,7 +126,7 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
 
     def warm(self) -> None:
         """Compile or load the kernels of transport."""
-        importlib.import_module("labseq_virtual.transport_kernels")
+        importlib.import_module("labseq_virtual.flight_kernels")
 
     def prepare(self, program: ToneProgram) -> float:
         """Check a program and keep it for the next ``play``.

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from labseq_virtual.flight import KELVIN, draw_atoms
+from labseq_virtual.flight_kernels import draw_atoms
+from labseq_virtual.formulas import KELVIN
 
 import labseq
 from labseq.analysis.overview import map_picture, scan_picture
@@ -134,7 +135,9 @@ def test_the_model_of_release_and_recapture_is_the_simulation_s_also_for_hot_ato
     waist, wavelength, depth, n = 0.98e-6, 808e-9, 300e-6, 20_000
     rayleigh = np.pi * waist**2 / wavelength
     depths = np.full(n, KELVIN * depth)
-    atoms = draw_atoms(depths, KELVIN * temperature, waist, rayleigh, np.random.default_rng(1))
+    atoms = draw_atoms(
+        depths, np.full(len(depths), KELVIN * temperature), waist, rayleigh, np.random.default_rng(1)
+    )
     t_s = np.array([5e-6, 15e-6, 40e-6])
     kept: list[float] = []
     for t in t_s:

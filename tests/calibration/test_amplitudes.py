@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labseq_virtual.handover import full_amplitudes
+from labseq_virtual.formulas import full_amplitudes
 from labseq_virtual.mobile_light import with_true_response
 from labseq_virtual.settings import MobileLightSettings
 from numpy.typing import NDArray

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 from typing import Any
@@ -18,25 +17,6 @@ from .scripts import load_script
 ROOT = Path(__file__).parents[2]
 TABLES = ROOT / "docs" / "_static" / "paper"
 PAGE = (ROOT / "docs" / "explanation" / "virtual-lab.md").read_text(encoding="utf-8")
-
-
-def rows(name: str) -> list[dict[str, float]]:
-    with (TABLES / f"{name}.csv").open(newline="", encoding="utf-8") as file:
-        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
-
-
-def fillings(*, fixed: bool) -> dict[int, float]:
-    return {int(row["dop"]): row["filling"] for row in rows("figure4") if (row["window_ms"] == 200) == fixed}
-
-
-def test_filling_declines_in_the_fixed_window_with_a_step_at_thirteen() -> None:
-    for fixed in (True, False):
-        found = fillings(fixed=fixed)
-        few, more, many = (
-            np.mean([found[dop] for dop in dops]) for dops in (range(3, 8), range(8, 13), range(13, 16))
-        )
-        assert few > more
-        assert more - many > 0.004 > 2 * (few - more)
 
 
 def test_the_page_is_what_the_script_writes(tmp_path: Path) -> None:

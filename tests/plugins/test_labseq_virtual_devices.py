@@ -169,7 +169,7 @@ def program(
     row_hz: float = GRID.row_frequency_hz[0],
     col_hz: float = GRID.column_frequency_hz[0],
     end_hz: float = GRID.column_frequency_hz[2],
-    amplitude: float = 0.5,
+    amplitude: float = 0.05,
     duration_s: float = 1e-3,
 ) -> ToneProgram:
     """Take the atom at (0, 0) to (0, 2)."""
@@ -242,7 +242,7 @@ def test_a_camera_cannot_look_while_atoms_move(lab: Lab) -> None:
 def test_the_safe_state_drops_atoms_in_flight(lab: Lab) -> None:
     lab.mobile.prepare(program())
     lab.mobile.play()
-    lab.clock.sleep(1.5e-3)
+    lab.clock.sleep(1.2e-3)  # between two sites
     lab.mobile.safe_state()
     lab.mobile.safe_state()
     assert not lab.simulation.truth()[0, 0]
@@ -278,7 +278,7 @@ def test_the_self_test_names_a_site_out_of_reach(lab: Lab) -> None:
 def test_no_kernel_is_left_to_be_compiled_by_the_first_image(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kernels = "labseq_virtual.transport_kernels"  # which takes longer than a camera may
+    kernels = "labseq_virtual.flight_kernels"  # which takes longer than a camera may
     monkeypatch.delitem(sys.modules, kernels, raising=False)
     assert isinstance(lab.mobile, NeedsWarmUp)
     lab.mobile.warm()

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from labseq_virtual.responses import beyond
 from labseq_virtual.settings import SimulationSettings
+from labseq_virtual.simulation import VirtualSimulation
 
-from labseq.model import MotionSpec
-
-PAPER = SimulationSettings()
+from labseq.model import MotionSpec, SiteGrid
+from labseq.plugin import Context
 
 
 @pytest.mark.parametrize(
@@ -21,23 +20,10 @@ PAPER = SimulationSettings()
             MotionSpec(speed_m_s=0.15, speed_profile="minimum_jerk"),
             ["profile.mobile_tweezers.speed is 150 um/ms; above 144 um/ms"],
         ),
-        (MotionSpec(speed_m_s=4.0), ["speed is 4000 um/ms; the virtual lab knows heat and loss from 0 "]),
-        (MotionSpec(speed_m_s=0.25, pick_up_s=2e-6), []),
-        (MotionSpec(drop_off_s=1e-3), ["drop_off is 1 ms; the virtual lab knows"]),
     ],
 )
-def test_moves_beyond_what_the_tables_were_derived_for(motion: MotionSpec, texts: list[str]) -> None:
-    found = beyond(motion, PAPER)
+def test_speeds_at_which_the_light_is_not_known(motion: MotionSpec, texts: list[str]) -> None:
+    context = Context("simulation", SiteGrid(), motion)
+    found = VirtualSimulation(SimulationSettings(), context).warnings()
     assert len(found) == len(texts)
     assert all(text in one for text, one in zip(texts, found, strict=True))
-
-
-def test_a_deeper_static_tweezer_bears_more_speed() -> None:
-    deep = PAPER.model_copy(update={"static_depth": 4 * PAPER.static_depth})
-    assert not [text for text in beyond(MotionSpec(speed_m_s=0.4), deep) if "speed" in text]
-
-
-def test_the_sound_of_the_tables_takes_ten_microseconds() -> None:
-    light = PAPER.mobile_light.model_copy(update={"transit_time": 6e-6})
-    (text,) = beyond(MotionSpec(), PAPER.model_copy(update={"mobile_light": light}))
-    assert all(fact in text for fact in ("mobile_light.transit_time is 6 us", "8 us to 12"))

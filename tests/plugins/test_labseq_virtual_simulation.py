@@ -197,7 +197,7 @@ def test_the_transport_loss_spreads_from_shot_to_shot_and_keeps_its_mean() -> No
     assert np.std(np.log(factors)) == pytest.approx(0.5, abs=0.04)
 
 
-@pytest.mark.parametrize("t_cut_s", [1.00003, 1.0005, 1.00107])
+@pytest.mark.parametrize("t_cut_s", [1.00003, 1.00056, 1.000876])
 def test_silence_cuts_a_program_short_and_atoms_in_flight_are_lost(t_cut_s: float) -> None:
     simulation = new_simulation(loading=1.0)
     simulation.load(0.0, 0.5)
