@@ -2,13 +2,37 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+ATOMS: Final = np.dtype(
+    [("exposure", np.int32), ("row", np.int16), ("col", np.int16), ("lost", np.bool_)],
+    metadata={
+        "descriptions": {
+            "exposure": "number of the exposure in the shot, from 0: the image of this number",
+            "row": "row of its site",
+            "col": "column of its site",
+            "lost": "whether the exposure lost it",
+        }
+    },
+)
+"""An atom that was there when an exposure began."""
+
+
+def table_of(exposures: Iterable[tuple[Mask, Mask]]) -> NDArray[Any]:
+    """The atoms of each exposure, :data:`ATOMS`; from where they were, and where they were lost."""
+    rows = [
+        (exposure, row, col, lost[row, col])
+        for exposure, (occupied, lost) in enumerate(exposures)
+        for row, col in np.argwhere(occupied)
+    ]
+    return np.array(rows, ATOMS)
 
 
 class Atoms:

@@ -387,6 +387,11 @@ class SimulationSettings(Settings):
         description="seed of what stays the same from run to run: depths, errors of tones, the camera's "
         "own patterns; none: the seed of the run. Calibrations hold for one machine only (ours)",
     )
+    record_truth: bool = Field(
+        default=False,
+        description="record the atoms that were really there in each exposure: the table `atom_events/atoms` "
+        "of each shot (ours)",
+    )
     depth_disorder: Fraction = Field(
         default=0.04,
         description="relative s.d. of the static tweezers' own depths, fixed for a seed (paper)",

@@ -28,7 +28,7 @@ from labseq.plugin import (
     format_quantity,
 )
 from labseq.plugin.simulation import WHOLE_SENSOR, RfSource, ToneSource
-from labseq_virtual.atoms import Atoms
+from labseq_virtual.atoms import Atoms, Mask, table_of
 from labseq_virtual.flight import Conditions, Flights, RunningProgram
 from labseq_virtual.formulas import noise_hz, recoil_heat
 from labseq_virtual.images import Exposure
@@ -247,8 +247,11 @@ class VirtualSimulation(Simulation):
         self._evaporate()
         light_on = self._lights.fraction_on("imaging", t_start_s, t_start_s + exposure_s)
         power, rng = self._static.depth, self._random.shot
+        before = self._atoms.occupied.copy()
         image, lost = self._exposure.take(self._atoms.occupied, exposure_s, rng, mode, light_on, power)
         self._lost += lost
+        if self._settings.record_truth:
+            self._exposed.append((before, before & ~self._atoms.occupied))
         self._now_s = t_start_s + exposure_s
         self._qubits = None
         aim = self._at_nominal(self._settings.temperature + recoil_heat(self._settings))
@@ -296,16 +299,18 @@ class VirtualSimulation(Simulation):
         return self._static.depth, self._mobile_light.of_outputs(rows, columns, now_s)
 
     def atom_events(self, since_s: float) -> Mapping[str, NDArray[Any]]:
-        """Events of the atoms that the mobile tweezers moved in this shot, if their outputs are connected.
+        """The atoms of this shot, as far as they are recorded.
 
         Returns:
-            "flights" (:data:`labseq_virtual.flight.FLIGHTS`) and "jumps"
-            (:data:`labseq_virtual.flight.JUMPS`); empty without connected outputs.
+            "atoms" (:data:`labseq_virtual.atoms.ATOMS`) with ``record_truth``; "flights"
+            (:data:`labseq_virtual.flight.FLIGHTS`) and "jumps" (:data:`labseq_virtual.flight.JUMPS`) if the
+            outputs of the mobile tweezers are connected.
         """
+        tables = {"atoms": table_of(self._exposed)} if self._settings.record_truth else {}
         if self._pulse_receiver is None:
-            return {}
+            return tables
         self._apply_output(self._clock.now())
-        return self._flights.tables(since_s)
+        return tables | self._flights.tables(since_s)
 
     def describe(self) -> Mapping[str, Any]:
         """Every constant of the model, in SI, and the seed of its disorder."""
@@ -446,6 +451,7 @@ class VirtualSimulation(Simulation):
         self._now_s = -math.inf
         self._loss_factor = 1.0
         self._lost: Counter[str] = Counter()
+        self._exposed: list[tuple[Mask, Mask]] = []
 
     def _check_open(self) -> None:
         if not self._is_open:

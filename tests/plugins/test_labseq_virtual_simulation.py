@@ -164,6 +164,25 @@ def test_an_exposure_loses_what_the_paper_says(exposure_s: float) -> None:
     assert within_four_sigma(survived, total, (0.9 * np.exp(-45e-3)) ** n_exposures)
 
 
+def test_the_true_atoms_of_each_exposure_are_recorded_if_asked_for() -> None:
+    assert "atoms" not in new_simulation().atom_events(0.0)
+    simulation = new_simulation(record_truth=True, imaging_loss=0.2)
+    simulation.load(0.0, 0.5)
+    occupied = [simulation.truth()]
+    for t_s in (0.5, 1.5):
+        simulation.expose(t_s, 45e-3)
+        occupied.append(simulation.truth())
+    atoms = simulation.atom_events(0.0)["atoms"]
+    for exposure, before in enumerate(occupied[:2]):
+        seen = atoms[atoms["exposure"] == exposure]
+        sites = np.zeros_like(before)
+        sites[seen["row"], seen["col"]] = True
+        assert (sites | before == before).all(), "the vacuum may lose some before the exposure"
+        sites[seen["row"][seen["lost"]], seen["col"][seen["lost"]]] = False
+        np.testing.assert_array_equal(sites, occupied[exposure + 1])
+    assert atoms["lost"].sum() > 0
+
+
 def test_atoms_shine_until_they_are_lost() -> None:
     light, dark = list[float](), {"background": 0.0, "clock_induced_charge": 0.0}
     for lifetime in (2e6, 5e-3):
