@@ -159,7 +159,7 @@ def test_for_people(perform: Any) -> None:
     session, out, err, _ = perform(as_json=False)
     assert err == ""
     lines = out.splitlines()
-    assert lines[-9:] == [
+    assert lines[-10:] == [
         f"run               {session.run_dir}",
         "sequence          compact-225, to compact",
         "status            complete",
@@ -167,6 +167,7 @@ def test_for_people(perform: Any) -> None:
         "defect-free       1 of 2 (50.0 %), 21.6 to 78.4 %",
         "seen defect-free  2 of 2 (100.0 %)",
         "filling           99.8(2) %",
+        "best shot         0: defect-free after 0 cycles, 1.9 s",
         "simulated time    3.8 s in all shots together",
         "computer time     2 s",
     ]

@@ -158,7 +158,7 @@ def test_what_was_skipped_is_reported_with_the_reasons(
     lines = capsys.readouterr().out.splitlines()
     assert "shots             0 of 8, 8 skipped" in lines
     assert "skipped           shots 0, 1, 2, 3, 4, ...: DeviceError: laser: went out of lock" in lines
-    assert r"skipped           shots 6, 7: filling\nfraction" in lines
+    assert "skipped           shots 6, 7: filling fraction" in lines
     show_run(skipped, as_json=True)
     assert json.loads(capsys.readouterr().out)["skipped_shots"] == [
         {"shots": [0, 1, 2, 3, 4, 5], "why": "DeviceError: laser: went out of lock"},
