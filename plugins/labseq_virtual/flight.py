@@ -56,6 +56,8 @@ SLEW_HZ: Final = 4e6
 """Largest deviation of a tone from its extrapolated frequency in a transit time (ours: 1100 um/ms at
 1.6 MHz per site)."""
 
+_FATE: Final = f"S{max(map(len, FATES))}"
+
 FLIGHTS: Final = np.dtype(
     [
         ("held_s", np.float64),
@@ -65,7 +67,7 @@ FLIGHTS: Final = np.dtype(
         ("to_col", np.int16),
         ("offset_m", np.float32),
         ("depth_K", np.float32),
-        ("fate", "S9"),
+        ("fate", _FATE),
         ("lost_s", np.float64),
         ("lost_row", np.float32),
         ("lost_col", np.float32),
@@ -330,7 +332,7 @@ def _table(flights: NDArray[Any]) -> NDArray[Any]:
     for name in ("held_s", "from_row", "from_col", "to_row", "to_col", "lost_s", "lost_row", "lost_col"):
         table[name] = flights[name]
     table["offset_m"], table["depth_K"] = flights["offset"], flights["depth"] / KELVIN
-    table["fate"] = np.array(FATES, "S9")[flights["fate"]]
+    table["fate"] = np.array(FATES, _FATE)[flights["fate"]]
     lost = flights["fate"] > 0
     table["to_row"][lost] = table["to_col"][lost] = -1
     return table
