@@ -121,7 +121,7 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
         {"- image: {exposure: 45 ms}": "- image: {exposure: 11 s}"},
         [
             "s.yaml:12:23: camera: exposure is 11 s; the limit is more than 0 and at most 10 s; choose another exposure",
-            "p.yaml:126:9: device calls time out after 10 s, but an exposure takes 11 s; expected more than 11 s",
+            "p.yaml:125:9: device calls time out after 10 s, but an exposure takes 11 s; expected more than 11 s",
         ],
     ),
     (

@@ -62,7 +62,8 @@ def test_a_rearrangement_hands_over_to_tweezers_of_their_present_depth(tmp_path:
     n_lost = dict[str, int]()
     for depth in ("100 %", "11 %"):
         for shot in shots(tmp_path, depth, "  - rearrange: {cycles: 1, window: 60 ms}\n"):
-            n_lost[depth] = n_lost.get(depth, 0) + shot.readings["simulation.lost.hand_over"]
+            lost = sum(shot.readings[f"simulation.lost.{cause}"] for cause in ("hand_over", "transport"))
+            n_lost[depth] = n_lost.get(depth, 0) + lost
             n_true, n_seen = shot.readings["simulation.n_atoms_true"], np.count_nonzero(shot.occupancies[-1])
             assert abs(n_true - n_seen) <= 4  # what was seen of the atoms is what there is
     assert n_lost["11 %"] > 2 * n_lost["100 %"]
