@@ -315,8 +315,8 @@ class AlarmSettings(Settings):
     )
     arrived: Fraction = Field(
         default=0.1,
-        description="least share of the atoms moved by the first cycle to empty sites that the next image shows "
-        "there, over as many shots as have 100 of them together; 0: no alarm",
+        description="least share of the atoms moved by the first cycle to empty sites that the next image "
+        "shows there, over as many shots as have 100 of them together; 0: no alarm",
     )
     clock: Duration = Field(
         default=10.0, description="largest jump of the computer's clock between two shots"
