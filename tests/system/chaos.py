@@ -371,11 +371,16 @@ def set_clock(bench: Bench, process: subprocess.Popen[str], chance: random.Rando
 
 
 def fill_disk(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> None:
-    """Fill the disk until the command has ended."""
+    """Fill the disk until the command has ended; the queue does not end, but waits until there is room."""
     ballast = bench.data.parent / "ballast"
     with contextlib.suppress(OSError), ballast.open("wb") as file:
         while True:
             file.write(bytes(65536))
+    deadline = time.monotonic() + 10.0
+    while process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    if process.poll() is None:
+        ballast.unlink()
 
 
 def lock_disk(bench: Bench, process: subprocess.Popen[str], chance: random.Random) -> bool:
@@ -510,7 +515,7 @@ def next_command(bench: Bench, job: str) -> list[str] | None:
     runs = bench.runs()
     if job == "queue":
         entries = json.loads(bench.run("queue", "list", "--json"))["entries"]
-        waiting = [entry for entry in entries if entry["state"] not in ("failed", "stopped")]
+        waiting = [entry for entry in entries if entry["state"] in ("waiting", "running", "interrupted")]
     else:
         waiting = not runs
     if waiting:
@@ -565,7 +570,7 @@ def made_bench(*, small_disk: bool) -> Generator[Bench]:
     folder = Path(tempfile.mkdtemp(prefix="labseq-chaos-"))
     disk = folder / "disk"
     disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(disk)]
+    mount = ["mount", "-t", "tmpfs", "-o", "size=256m", "tmpfs", str(disk)]
     is_mounted = small_disk and subprocess.run(mount, check=False, capture_output=True).returncode == 0
     try:
         yield Bench(folder, disk if is_mounted else None)
