@@ -47,10 +47,8 @@ from labseq.model import (
     VisitedPoint as VisitedPoint,
     as_occupancy as as_occupancy,
 )
-from labseq.motion import (
-    check_plan as check_plan,
-    render as render,
-)
+from labseq.motion import check_plan as check_plan
+from labseq.motion.rendering import render as render
 from labseq.session.session import Session as Session
 
 __version__: str
