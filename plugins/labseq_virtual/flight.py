@@ -24,6 +24,7 @@ from labseq.plugin.motion import FrequencyCourse
 from labseq_virtual.atoms import Atoms
 from labseq_virtual.formulas import (
     KELVIN,
+    MIN_TONE_DEPTH,
     full_amplitudes,
     full_volts,
     noise_hz,
@@ -50,8 +51,6 @@ Mask = NDArray[np.bool_]
 
 DARK: Final = 0.1
 """Fraction of the full depth below which the tweezers of a batch have let go of their atoms (ours)."""
-MIN_TONE_DEPTH: Final = 2e-3
-"""Fraction of the full depth below which a tone counts as off (ours)."""
 SLEW_HZ: Final = 4e6
 """Largest deviation of a tone from its extrapolated frequency in a transit time (ours: 1100 um/ms at
 1.6 MHz per site)."""
@@ -294,7 +293,7 @@ class Flights:
 
 
 def machine(settings: SimulationSettings, conditions: Conditions) -> tuple[float, ...]:
-    """The numbers of :class:`labseq_virtual.flight_kernels.Machine`."""
+    """The numbers of :class:`labseq_virtual.atom_kernels.Machine`."""
     light = settings.mobile_light
     return (
         KELVIN * settings.static_depth,

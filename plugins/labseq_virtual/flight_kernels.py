@@ -9,20 +9,43 @@ Energies and depths are per mass, in m^2/s^2. Arguments that occur in several ke
 - ``flights``, ``state``: the atoms near which a tweezer came so far, :class:`Flight` and ``atom`` of each.
 - ``sites``: the sites and their atoms, ``Site`` (n_rows, n_cols).
 - ``machine``: the constants, :class:`Machine`.
-
-Atoms that need it are integrated in single precision, several at once, so that the compiler uses the
-processor's vector instructions: they are the *lanes* of a flat array.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import const, helper_kernel, kernel
+from labseq_virtual.atom_kernels import (
+    AWAY_X,
+    AWAY_Y,
+    COL,
+    COL_CHANGE,
+    LANES,
+    MACHINE,
+    N_NUMBERS,
+    ROW,
+    ROW_CHANGE,
+    STATIC,
+    VX,
+    VY,
+    VZ,
+    WAY_X,
+    WAY_Y,
+    ZERO,
+    Machine,
+    X,
+    Y,
+    Z,
+    draw_atom,
+    energy_in,
+    move,
+    pull,
+)
 from labseq_virtual.formulas import KELVIN
 from labseq_virtual.light_kernels import (
     CHANGE,
@@ -63,37 +86,6 @@ COLDEST = 0.1
 """Least temperature after a flight over that before it: the energies of one atom scatter."""
 
 
-class Machine(NamedTuple):
-    """The constants of the machine and of a program.
-
-    Attributes:
-        static_depth: Nominal depth of a static tweezer.
-        static_waist: 1/e^2 radius of its intensity, in metres.
-        static_rayleigh: Its Rayleigh length.
-        mobile_depth: Depth of a mobile tweezer whose tones have their intended power.
-        mobile_waist: Its radius.
-        mobile_rayleigh: Its Rayleigh length.
-        temperature: Of cooled atoms, in kelvin.
-        cooling_hz: Rate at which the cooling light brings atoms back to it; 0 without light.
-        noise_hz: Rate at which noise of the intensity heats an atom in a nominal static tweezer.
-        loss: Probability that an atom which was moved is lost, beyond what its flight loses.
-        pair_survival: Probability that of two atoms in one tweezer one is left.
-    """
-
-    static_depth: float
-    static_waist: float
-    static_rayleigh: float
-    mobile_depth: float
-    mobile_waist: float
-    mobile_rayleigh: float
-    temperature: float
-    cooling_hz: float
-    noise_hz: float
-    loss: float
-    pair_survival: float
-
-
-MACHINE: Final = f"UniTuple(float64, {len(Machine._fields)})"
 KEPT, HAND_OVER, TRANSPORT, COLLISION, EJECTED, PROGRAM, FLYING, SETTLED = range(8)
 """Places in ``FATES``; the last two only on the way: a settled atom is bound by its static tweezer alone, and
 is not moved until a mobile one comes near."""
@@ -144,203 +136,6 @@ class Flight:
 
 
 FLIGHT: Final = record(Flight)
-
-
-@helper_kernel()
-def pull(
-    x: float, y: float, z: float, depth: float, waist: float, rayleigh: float
-) -> tuple[float, float, float, float]:
-    """Acceleration of an atom by a Gaussian beam along z, and its potential energy per mass.
-
-    ``U = -depth / s exp(-2 r^2 / (waist^2 s))`` with ``s = 1 + (z / rayleigh)^2``
-    (R. Grimm, M. Weidemueller, Y. Ovchinnikov, Adv. At. Mol. Opt. Phys. 42, 95, 2000).
-
-    Args:
-        x: Distance from the beam's axis, in metres.
-        y: The same in the other direction.
-        z: Position along the axis, from the focus.
-        depth: Depth per mass.
-        waist: 1/e^2 radius of the intensity.
-        rayleigh: Rayleigh length.
-    """
-    s = 1.0 + (z / rayleigh) ** 2
-    q = 2.0 * (x * x + y * y) / (waist * waist * s)
-    energy = depth / s * math.exp(-q)
-    radial = -4.0 * energy / (waist * waist * s)
-    axial = -2.0 * energy * (1.0 - q) / (s * rayleigh * rayleigh)
-    return radial * x, radial * y, axial * z, -energy
-
-
-@helper_kernel()
-def energy_in(atom: Floats, x: float, y: float, depth: float, waist: float, rayleigh: float) -> float:
-    """Energy of an atom in one tweezer at a place, negative if that binds it."""
-    kinetic = 0.5 * (atom[3] * atom[3] + atom[4] * atom[4] + atom[5] * atom[5])
-    return kinetic + pull(atom[0] - x, atom[1] - y, atom[2], depth, waist, rayleigh)[3]
-
-
-LANES: Final = 8
-"""Atoms that are moved together: those of a vector of 256 bits."""
-N_NUMBERS: Final = 15
-X, Y, Z, VX, VY, VZ, STATIC, AWAY_X, AWAY_Y, WAY_X, WAY_Y, ROW, ROW_CHANGE, COL, COL_CHANGE = (
-    LANES * n for n in range(N_NUMBERS)
-)
-"""Where each number of the lanes begins: position relative to the static tweezer, velocity, its depth;
-the mobile tweezer's place relative to the static one and its displacement until the next frame, the factors
-of its depth, and their changes."""
-ZERO, HALF_, ONE, TWO, FARTHEST = (np.float32(x) for x in (0.0, 0.5, 1.0, 2.0, 40.0))
-SHORTER = np.float32(-1.0 / 32.0)
-C2, C3, C4, C5 = (np.float32(1.0 / math.factorial(n)) for n in range(2, 6))
-
-
-@helper_kernel()
-def fall(q: np.float32) -> np.float32:
-    """exp(-q) for q of at least 0, as (exp(-q / 32))^32 with a series: to 1e-5 at 8, without branches."""
-    u = min(q, FARTHEST) * SHORTER
-    e = ONE + u * (ONE + u * (C2 + u * (C3 + u * (C4 + u * C5))))
-    e *= e
-    e *= e
-    e *= e
-    e *= e
-    return e * e
-
-
-@helper_kernel()
-def pull_fast(
-    x: np.float32, y: np.float32, z: np.float32, depth: np.float32, width: np.float32, length: np.float32
-) -> tuple[np.float32, np.float32]:
-    """As ``pull``, in single precision: what x and y, and what z is multiplied with for the acceleration.
-
-    ``width`` is 2 / waist^2, ``length`` 1 / rayleigh^2.
-    """
-    g = ONE / (ONE + z * z * length)
-    q = (x * x + y * y) * width * g
-    energy = depth * g * fall(q)
-    return -TWO * width * g * energy, -TWO * energy * (ONE - q) * g * length
-
-
-@helper_kernel()
-def move(lanes: NDArray[np.float32], machine: Machine, duration_s: float, n_steps: int) -> None:
-    """Move the atoms of all lanes from one frame to the next, in which all light changes evenly: leapfrog."""
-    width_s, length_s = np.float32(2 / machine.static_waist**2), np.float32(1 / machine.static_rayleigh**2)
-    width_m, length_m = np.float32(2 / machine.mobile_waist**2), np.float32(1 / machine.mobile_rayleigh**2)
-    depth, dt = np.float32(machine.mobile_depth), np.float32(duration_s / n_steps)
-    half = HALF_ * dt
-    for step in range(n_steps):
-        part = np.float32((step + 0.5) / n_steps)
-        for i in range(LANES):
-            x = lanes[X + i] + half * lanes[VX + i]
-            y = lanes[Y + i] + half * lanes[VY + i]
-            z = lanes[Z + i] + half * lanes[VZ + i]
-            radial_s, axial_s = pull_fast(x, y, z, lanes[STATIC + i], width_s, length_s)
-            right = x - lanes[AWAY_X + i] - part * lanes[WAY_X + i]
-            up = y - lanes[AWAY_Y + i] - part * lanes[WAY_Y + i]
-            row = lanes[ROW + i] + part * lanes[ROW_CHANGE + i]
-            col = lanes[COL + i] + part * lanes[COL_CHANGE + i]
-            radial_m, axial_m = pull_fast(right, up, z, depth * row * col, width_m, length_m)
-            vx = lanes[VX + i] + dt * (radial_s * x + radial_m * right)
-            vy = lanes[VY + i] + dt * (radial_s * y + radial_m * up)
-            vz = lanes[VZ + i] + dt * (axial_s + axial_m) * z
-            lanes[VX + i], lanes[VY + i], lanes[VZ + i] = vx, vy, vz
-            lanes[X + i] = x + half * vx
-            lanes[Y + i] = y + half * vy
-            lanes[Z + i] = z + half * vz
-
-
-WIDER = 2.2
-"""Width of the proposed positions relative to a harmonic well's: covers a beam's weaker flanks."""
-LONGER = 4.0
-"""The same along the beam."""
-
-
-@helper_kernel()
-def draw_place(most: float, atom: Floats, rng: np.random.Generator) -> float:
-    """Draw a position in units of waist and Rayleigh length; returns -U / kT there. See ``draw_atoms``."""
-    across, along = WIDER / math.sqrt(4.0 * most), LONGER / math.sqrt(2.0 * most)
-    while True:
-        nx, ny, nz = rng.standard_normal(), rng.standard_normal(), rng.standard_normal()
-        x, y, z = across * nx, across * ny, along * nz
-        s = 1.0 + z * z
-        a = most / s * math.exp(-2.0 * (x * x + y * y) / s)
-        part = rng.random() / math.exp(a - most + 0.5 * (nx * nx + ny * ny + nz * nz))
-        if part < 1.0 and part < math.erf(math.sqrt(a)) - 2.0 * math.sqrt(a / math.pi) * math.exp(-a):
-            atom[0], atom[1], atom[2] = x, y, z
-            return a
-
-
-@helper_kernel()
-def draw_atom(
-    atom: Floats, depth: float, kt: float, waist: float, rayleigh: float, rng: np.random.Generator
-) -> None:
-    """Draw one atom at the origin, as :func:`draw_atoms` does; ``kt`` is per mass."""
-    kt = min(kt, 0.5 * depth)
-    bound = draw_place(depth / kt, atom, rng)
-    atom[0], atom[1], atom[2] = waist * atom[0], waist * atom[1], rayleigh * atom[2]
-    while True:
-        vx, vy, vz = rng.standard_normal(), rng.standard_normal(), rng.standard_normal()
-        if 0.5 * (vx * vx + vy * vy + vz * vz) < bound:
-            fast = math.sqrt(kt)
-            atom[3], atom[4], atom[5] = fast * vx, fast * vy, fast * vz
-            return
-
-
-@kernel(f"float64[:, ::1]({const('float64', 1)}, {const('float64', 1)}, float64, float64, npy_rng)")
-def draw_atoms(depth: Floats, kt: Floats, waist: float, rayleigh: float, rng: np.random.Generator) -> Floats:
-    """Draw atoms from the Boltzmann distribution in a Gaussian beam, restricted to bound atoms.
-
-    Positions have the density ``exp(a) P(a)``, where ``a = -U / kT`` and
-    ``P(a) = erf(sqrt(a)) - 2 sqrt(a / pi) exp(-a)`` is the fraction of the Maxwell distribution slow enough
-    to be bound there. They are drawn by rejection from a wider Gaussian. This distribution is stationary;
-    the harmonic one would breathe. In tweezers too shallow for the temperature, the temperature is half of
-    the depth: hotter atoms have evaporated.
-
-    Args:
-        depth: Depth of each atom's tweezer per mass, (n_atoms,), above 0.
-        kt: kT per mass of each atom.
-        waist: 1/e^2 radius of the intensity.
-        rayleigh: Rayleigh length.
-        rng: Random numbers.
-
-    Returns:
-        Positions relative to the tweezers' foci, and velocities, (n_atoms, 6).
-    """
-    atoms = np.empty((len(depth), 6))
-    for i in range(len(depth)):
-        draw_atom(atoms[i], depth[i], kt[i], waist, rayleigh, rng)
-    return atoms
-
-
-@kernel(f"float64[::1](float64[:, ::1], {const('float64', 1)}, float64, float64, float64, float64)")
-def ramp_atoms(
-    state: Floats, depth: Floats, end: float, duration_s: float, waist: float, rayleigh: float
-) -> Floats:
-    """Move atoms while the depth of their static tweezers changes evenly.
-
-    Args:
-        state: The atoms, each relative to its tweezer (n_atoms, 6); changed in place.
-        depth: Depth of each tweezer at the start (n_atoms,).
-        end: Depth at the end over that at the start.
-        duration_s: Duration of the ramp.
-        waist: 1/e^2 radius of the intensity.
-        rayleigh: Rayleigh length.
-
-    Returns:
-        Energies in the tweezers at the end (n_atoms,).
-    """
-    energy = np.empty(len(state))
-    for i in range(len(state)):
-        x, y, z, vx, vy, vz = state[i]
-        period_s = math.pi * waist / math.sqrt(depth[i] * max(1.0, end))
-        n_steps = math.ceil(16.0 * duration_s / period_s)
-        dt = duration_s / max(n_steps, 1)
-        for step in range(n_steps):
-            x, y, z = x + 0.5 * dt * vx, y + 0.5 * dt * vy, z + 0.5 * dt * vz
-            now = depth[i] * (1.0 + (end - 1.0) * (step + 0.5) / n_steps)
-            ax, ay, az, _ = pull(x, y, z, now, waist, rayleigh)
-            vx, vy, vz = vx + dt * ax, vy + dt * ay, vz + dt * az
-            x, y, z = x + 0.5 * dt * vx, y + 0.5 * dt * vy, z + 0.5 * dt * vz
-        state[i] = np.array([x, y, z, vx, vy, vz])
-        energy[i] = energy_in(state[i], 0.0, 0.0, end * depth[i], waist, rayleigh)
-    return energy
 
 
 @helper_kernel()
@@ -783,21 +578,9 @@ def fly(
         for m in range(0, n_moving, LANES):
             some = moving[m : min(m + LANES, n_moving)]
             move_some(
-                lanes,
-                origin,
-                some,
-                state,
-                flights,
-                rows,
-                cols,
-                k,
-                last,
-                n_steps,
-                sites,
-                frame_s,
-                plane,
+                lanes, origin, some, state, flights, rows, cols, k, last, n_steps, sites, frame_s, plane,
                 machine,
-            )
+            )  # fmt: skip
         for i in moving[:n_moving]:
             check_atom(flights[i], state[i], rows, cols, last, sites, end_s, end_s - now_s, plane, machine)
             check_faults(

@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 
 KELVIN: Final = 1.380649e-23 / (86.909180531 * 1.66053906660e-27)
 """m^2/s^2 per kelvin: energies per mass of 87Rb (AME2020, CODATA 2018)."""
+MIN_TONE_DEPTH: Final = 2e-3
+"""Fraction of the full depth below which a tone counts as off (ours)."""
 
 
 def rayleigh_length(waist_m: float, wavelength_m: float) -> float:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from labseq.plugin import const, helper_kernel, kernel
 from labseq.plugin.motion import FrequencyCourse
+from labseq_virtual.formulas import MIN_TONE_DEPTH
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -38,8 +39,6 @@ EVEN: Final = 1e-6
 """Bend of a tone's course from frame to frame, in sites, that is neglected."""
 NEVER: Final = 1 << 30
 """Stands for a frame that does not come."""
-MIN_DEPTH: Final = 2e-3
-"""Fraction of the full depth below which a tone counts as off (ours)."""
 ON: Final = 1e-6
 """Power relative to the intended one above which a tone is on (ours)."""
 PLACE, WAY, DEPTH, CHANGE = range(4)
@@ -200,7 +199,7 @@ def smooth(played: Floats, power: Floats, hz: float, place: Floats, depth: Float
             moment += weighted * played[k + m]
             field += WEIGHT[m] * volts[k + m]
         depth[k] = field**2
-        place[k] = moment / total if depth[k] > MIN_DEPTH else np.nan
+        place[k] = moment / total if depth[k] > MIN_TONE_DEPTH else np.nan
     for k in range(1, n - 1):
         chirp = 0.5 * (place[k + 1] - place[k - 1])
         if abs(place[k + 1] - place[k] - chirp) > EVEN:  # never for nan

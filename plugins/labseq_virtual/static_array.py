@@ -149,7 +149,8 @@ class StaticArray:
 
     def _lower(self, fraction: float, duration_s: float, atoms: Atoms, rng: np.random.Generator) -> None:
         """Let atoms fly while their tweezers become shallower; those that are unbound at the end are lost."""
-        from labseq_virtual.flight_kernels import COLDEST, ramp_atoms
+        from labseq_virtual.atom_kernels import ramp_atoms
+        from labseq_virtual.flight_kernels import COLDEST
 
         atoms.occupied &= (self.depth > 0) & (fraction > OFF)
         row, col = np.nonzero(atoms.occupied)
@@ -172,7 +173,7 @@ class StaticArray:
         self, atoms: Atoms, row: Sites, col: Sites, rng: np.random.Generator
     ) -> tuple[Floats, Floats, Floats]:
         """Draw atoms in their tweezers; also returns the depths per mass, and relative to the nominal one."""
-        from labseq_virtual.flight_kernels import draw_atoms
+        from labseq_virtual.atom_kernels import draw_atoms
 
         level = self.depth[row, col]
         depth = KELVIN * self._settings.static_depth * level

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from labseq_virtual.flight_kernels import draw_atoms
+from labseq_virtual.atom_kernels import draw_atoms
 from labseq_virtual.formulas import KELVIN
 
 import labseq

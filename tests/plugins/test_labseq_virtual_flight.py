@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from labseq_virtual import flight_kernels as kernels
+from labseq_virtual.atom_kernels import LANES, Machine, draw_atoms, move, pull, ramp_atoms
 from labseq_virtual.atoms import Atoms
 from labseq_virtual.flight import Conditions, Flights, RunningProgram
-from labseq_virtual.flight_kernels import LANES, Machine, draw_atoms, fly_in_light, move, pull, ramp_atoms
+from labseq_virtual.flight_kernels import fly_in_light
 from labseq_virtual.formulas import KELVIN
 from labseq_virtual.light_kernels import DEPTH, FRAMES_PER_TRANSIT, HALF, PLACE, find_batches, light_of_axis
 from labseq_virtual.records import FATES, SITE
