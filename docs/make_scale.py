@@ -34,7 +34,7 @@ from labseq.motion.rendering import Renderer
 from labseq.plain import now_utc
 from labseq.plugin import Context, Frame, MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern, ToneProgram
 from labseq.plugin.motion import RfSpec
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 PAGE: Final = Path(__file__).parent / "explanation" / "scale.md"
 PICTURE: Final = Path(__file__).parent / "_static" / "planners" / "scale.png"

@@ -52,12 +52,9 @@ _HOMES = {
     ),
     "labseq.motion": ("check_plan",),
     "labseq.motion.rendering": ("render",),
-    "labseq.data": (
-        "Run",
-        "open_run",
-    ),
     "labseq.data.catalogue": ("runs",),
     "labseq.data.entry": ("RunEntry",),
+    "labseq.data.reader": ("Run", "open_run"),
     "labseq.session.session": ("Session",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

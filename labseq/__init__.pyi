@@ -6,12 +6,9 @@ from labseq.api import (
     make_target as make_target,
     tone_program as tone_program,
 )
-from labseq.data import (
-    Run as Run,
-    open_run as open_run,
-)
 from labseq.data.catalogue import runs as runs
 from labseq.data.entry import RunEntry as RunEntry
+from labseq.data.reader import Run as Run, open_run as open_run
 from labseq.errors import (
     ConfigError as ConfigError,
     DeviceError as DeviceError,

@@ -19,7 +19,7 @@ from labseq.campaigns.certificates import make_certificates
 from labseq.campaigns.running import run_at_once, run_in_turn
 from labseq.cli import main
 from labseq.cluster import ClusterWorkers
-from labseq.data import Run
+from labseq.data.reader import Run
 from labseq.errors import ConfigError, StopRequested
 from labseq.recording.run_file import read_state
 from labseq.session.session import Session

@@ -13,7 +13,7 @@ from labseq.config.document import Document
 from labseq.console.output import say
 from labseq.console.runs import chosen_run
 from labseq.console.text import first_of, plural
-from labseq.data import Run
+from labseq.data.reader import Run
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean, visible
 from labseq.session.analyses import AnalysisOutcome, analyse_missing, analyses_of

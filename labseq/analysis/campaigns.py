@@ -14,11 +14,12 @@ from labseq.analysis.scanned import title_of, value_text
 from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, Point, recorded_runs
 from labseq.console.output import say
 from labseq.console.text import plural
-from labseq.data import Run, Shot
 from labseq.data.columns import quantities_in
 from labseq.data.points import ScanPoint
 from labseq.data.quantities import WITH_TARGET, Quantity, description_of, measured_by
+from labseq.data.reader import Run
 from labseq.data.scanned import Scanned, make_axis
+from labseq.data.shot import Shot
 from labseq.data.tables import check_installed
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import explained, whole_file

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.analysis.timing import Quantiles, StageStatistics
-from labseq.data import Run, Shot
 from labseq.data.images import average_frame, signals_of
+from labseq.data.reader import Run
+from labseq.data.shot import Shot
 from labseq.model import SiteGrid
 from labseq.model.estimate import Estimate, Estimated, Rate, mean
 from labseq.pictures.figures import (

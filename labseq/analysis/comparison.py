@@ -21,13 +21,13 @@ from labseq.console.output import say
 from labseq.console.report import aligned, filled_columns, print_report
 from labseq.console.runs import chosen_run
 from labseq.console.text import plural
-from labseq.data import Run
 from labseq.data.catalogue import runs
 from labseq.data.described import read_entry
 from labseq.data.entry import RunEntry
 from labseq.data.fits import Fit
 from labseq.data.numbers import Parameter, Result, readable
 from labseq.data.quantities import Quantity, find_quantity, measured_by
+from labseq.data.reader import Run
 from labseq.data.results import as_parameter, own_fits, reported
 from labseq.data.scanned import Axis, is_geometric, scanned
 from labseq.errors import ConfigError, LabseqError, Problem

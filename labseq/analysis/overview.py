@@ -38,7 +38,6 @@ from labseq.analysis.scanned import (
 from labseq.analysis.statistics import Statistics, Survival, SurvivalCounts, statistics_of
 from labseq.analysis.timing import STEP, RunTiming, StageTotals
 from labseq.calibration_store import read_entry
-from labseq.data import Run, Shot
 from labseq.data.fits import Fit
 from labseq.data.images import loading_map
 from labseq.data.numbers import readable
@@ -51,8 +50,10 @@ from labseq.data.quantities import (
     steps_that_load,
     why_no_results,
 )
+from labseq.data.reader import Run
 from labseq.data.results import own_fits
 from labseq.data.scanned import FitAt, Scanned, is_geometric, scanned
+from labseq.data.shot import Shot
 from labseq.data.site_maps import SiteMap, site_map
 from labseq.detection.sites import KnownSites, SiteSettings, known_sites
 from labseq.errors import ConfigError, Problem, RecordingError, one_of

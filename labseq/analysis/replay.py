@@ -21,7 +21,8 @@ from labseq.assembly.plugin_choice import ChosenPlugin, changed_settings, resolv
 from labseq.assembly.point import Point
 from labseq.assembly.recorded import calibrations_of, files_of, machine_of
 from labseq.config.addresses import Override, split_overrides
-from labseq.data import Run, Shot
+from labseq.data.reader import Run
+from labseq.data.shot import Shot
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError, collecting
 from labseq.guard import Guard
 from labseq.messages import clean, format_plugin_error

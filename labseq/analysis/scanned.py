@@ -9,7 +9,6 @@ from typing import Any
 
 from labseq.console.report import aligned
 from labseq.console.text import count_of
-from labseq.data import Run
 from labseq.data.columns import Column, make_column
 from labseq.data.fits import Fit
 from labseq.data.points import ScanPoint
@@ -21,6 +20,7 @@ from labseq.data.quantities import (
     measured_by,
     quantity_of,
 )
+from labseq.data.reader import Run
 from labseq.data.results import own_fits, reported
 from labseq.data.scanned import FitAt, FitRequest, Scanned, fits_along, scanned
 from labseq.errors import ConfigError, Problem

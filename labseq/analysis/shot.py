@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.analysis.overview import cannot_draw, grid_of, note_of, sites_of
-from labseq.data import Run, Shot
+from labseq.data.reader import Run
+from labseq.data.shot import Shot
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
 from labseq.model import CycleRecord, ImageRecord, Occupancy, ShotRecord, SiteGrid, TargetPattern

@@ -11,7 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.data import Run, Shot
+from labseq.data.reader import Run
+from labseq.data.shot import Shot
 from labseq.errors import RecordingError
 from labseq.model import StageTiming
 from labseq.model.records import OVERSHOOT_S, STEP

@@ -16,7 +16,7 @@ from labseq.messages import clean, did_you_mean, listing
 from labseq.model import TargetPattern
 from labseq.model.image_quantities import OF_IMAGES, parse_name
 from labseq.model.records import unique_names
-from labseq.recording.folders import RESULT_PREFIX
+from labseq.recording.folders import split_result
 from labseq.recording.index import SIMULATION
 from labseq.roles import Hardware, Step
 from labseq.sequencer.clock import CLOCK_SET, SLEPT
@@ -103,12 +103,10 @@ def check_quantity(
 
 def _analysis_hint(name: str, results: Iterable[str]) -> str:
     """How to get the result of an analysis that the sequence does not list; "" for other names."""
-    analysis = name.removeprefix(RESULT_PREFIX).split(".")[0]
-    if not name.startswith(RESULT_PREFIX) or any(
-        result.startswith(f"{RESULT_PREFIX}{analysis}.") for result in results
-    ):
+    split = split_result(name)
+    if split is None or split[0] in {one[0] for one in map(split_result, results) if one}:
         return ""
-    return f"the sequence must list the analysis: 'analysis: [{{use: {clean(analysis)}}}]'"
+    return f"the sequence must list the analysis: 'analysis: [{{use: {clean(split[0])}}}]'"
 
 
 def missing_quantity(shot: int, name: str, purpose: str, quantities: Iterable[str]) -> str:

@@ -31,7 +31,7 @@ from labseq.calibration_store import Store, Stored, grid_text
 from labseq.config.addresses import Override, split_overrides
 from labseq.config.profile import OFF, ProfileSpec, load_profile
 from labseq.console.runs import folder_of_run
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.messages import clean, install_hint
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, SiteGrid, grid_facts, same_grid

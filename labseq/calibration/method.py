@@ -14,7 +14,7 @@ from labseq.assembly.lab import construct
 from labseq.assembly.profile import ResolvedProfile
 from labseq.assembly.recorded import recorded_machine
 from labseq.calibration_store import read_entry
-from labseq.data import Run
+from labseq.data.reader import Run
 from labseq.errors import ConfigError, DeviceError, Problem
 from labseq.guard import StopFlag
 from labseq.model import CalibrationKind, Frame, MotionSpec, SiteGrid

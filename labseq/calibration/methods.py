@@ -24,7 +24,7 @@ from labseq.builtin.overlay import (
 )
 from labseq.calibration.method import AnalysisResult, CalibrationData, ProbeCounts, count_probed
 from labseq.calibration.pictures import draw_powers, draw_sites, draw_survival, draw_tone_offsets
-from labseq.data import Run
+from labseq.data.reader import Run
 from labseq.detection.lattice import FoundLattice, find_lattice
 from labseq.detection.sites import read_sites
 from labseq.errors import ConfigError, DeviceError, Problem

@@ -16,7 +16,7 @@ from labseq.assembly.options import Options
 from labseq.config.addresses import split_overrides
 from labseq.config.document import Document, StoredText
 from labseq.config.find import find_profile, find_sequence
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.errors import ConfigError, Problem
 from labseq.messages import visible
 from labseq.recording.folders import RUN_FILE

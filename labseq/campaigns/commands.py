@@ -10,7 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from labseq.campaigns.campaign import Campaign, PlannedRun, Point
-    from labseq.data import Run
+    from labseq.data.reader import Run
 
 campaign = typer.Typer(
     name="campaign",

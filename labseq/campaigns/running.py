@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 from labseq.campaigns.campaign import CAMPAIGN_FILE, Campaign, PlannedRun, Point, run_folders
 from labseq.config.document import Document
 from labseq.console.output import say
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.errors import AlarmError, ConfigError, LabseqError, Problem
 from labseq.files import explained, write_file
 from labseq.guard import StopFlag, stop_on_signals

@@ -14,8 +14,8 @@ from labseq.console.output import say
 from labseq.console.report import Column, print_report, table
 from labseq.console.runs import chosen_run, folder_of_run
 from labseq.console.text import plural
-from labseq.data import Run
 from labseq.data.export import ENDINGS, check_export, export_run, files_of, write_columns
+from labseq.data.reader import Run
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import explained
 from labseq.messages import visible

@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.data import Run, open_run
 from labseq.data.fit_models import MODELS
 from labseq.data.fits import Fit
 from labseq.data.points import planned_points
 from labseq.data.precision import follows
+from labseq.data.reader import Run, open_run
 from labseq.data.results import own_fits, reported
 from labseq.data.scanned import on_axes
 from labseq.data.series import Series

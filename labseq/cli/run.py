@@ -17,7 +17,7 @@ from labseq.console.events import LogLines
 from labseq.console.output import as_line, say, stdout_to_stderr
 from labseq.console.runs import folder_of_run
 from labseq.console.text import plural, quoted
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem, RecordingError
 from labseq.files import packaged_profiles_dir, packaged_sequences_dir
 from labseq.messages import install_hint, visible

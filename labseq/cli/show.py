@@ -17,8 +17,9 @@ from labseq.console.output import say
 from labseq.console.report import Column, print_report, table
 from labseq.console.runs import chosen_run
 from labseq.console.text import percent, settings_text, time_text
-from labseq.data import Run, Shot
 from labseq.data.quantities import WITH_TARGET, measured_by, quantity_of
+from labseq.data.reader import Run
+from labseq.data.shot import Shot
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.messages import clean, visible
 from labseq.model.image_quantities import OF_IMAGES, parse_name

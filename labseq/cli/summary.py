@@ -23,10 +23,10 @@ from labseq.analysis.statistics import CycleStatistics, Statistics, statistics_o
 from labseq.console.errors import lines_of
 from labseq.console.report import Column, Facts, aligned, table
 from labseq.console.text import count_of, percent, plural, quoted
-from labseq.data import Run
 from labseq.data.best import BestPoint, BestShot, best_point, best_shot
 from labseq.data.follower import Follower
 from labseq.data.quantities import WITH_TARGET, Quantity, measured_by, quantity_of
+from labseq.data.reader import Run
 from labseq.data.scanned import scanned
 from labseq.errors import StopRequested
 from labseq.messages import clean, one_line, visible

@@ -13,8 +13,8 @@ from labseq.cli.live import observer_for
 from labseq.cli.summary import Summary
 from labseq.console.output import say
 from labseq.console.runs import folder_of_run
-from labseq.data import open_run
 from labseq.data.follower import Follower
+from labseq.data.reader import open_run
 from labseq.files import data_root
 from labseq.recording.listing import newest_run
 from labseq.session.stopping import is_running

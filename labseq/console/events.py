@@ -12,7 +12,7 @@ from labseq.console.text import percent, plural
 from labseq.messages import clean
 from labseq.model import RunRecord
 from labseq.model.image_quantities import measured_in
-from labseq.recording.folders import RESULT_PREFIX
+from labseq.recording.folders import RESULT_PREFIX, split_result
 from labseq.recording.index import IndexRow
 from labseq.recording.results import Results, results_file
 from labseq.units import format_quantity, written
@@ -52,8 +52,10 @@ class LogLines:
         if name == "run_starting":
             self._run = values["record"]
             names = measured_in(values["record"].resolved) if "shot_finished" in self._events else ()
-            of_analyses = (one for one in names if one.startswith(RESULT_PREFIX))
-            self._results = [MeasuredResults(Path(values["run_dir"]), one) for one in of_analyses]
+            run_dir = Path(values["run_dir"])
+            self._results = [
+                MeasuredResults(run_dir, *split) for split in map(split_result, names) if split is not None
+            ]
         text = event_text(name, values, self._run) if name in self._events else ""
         if text:
             say(text, stream=self._stream)
@@ -73,12 +75,13 @@ class MeasuredResults:
 
     Args:
         run_dir: The run's folder.
-        name: "analysis.NAME.KEY".
+        analysis: Name of the analysis.
+        key: Name of the result.
     """
 
-    def __init__(self, run_dir: Path, name: str) -> None:
-        analysis, _, self._key = name.removeprefix(RESULT_PREFIX).partition(".")
-        self._name = clean(name)
+    def __init__(self, run_dir: Path, analysis: str, key: str) -> None:
+        self._key = key
+        self._name = clean(f"{RESULT_PREFIX}{analysis}.{key}")
         self._results = Results(results_file(run_dir, analysis))
         self._awaited: set[int] = set()
 

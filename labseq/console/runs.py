@@ -13,7 +13,7 @@ from labseq.recording.folders import find_run
 from labseq.recording.listing import newest_run
 
 if TYPE_CHECKING:
-    from labseq.data import Run
+    from labseq.data.reader import Run
 
 
 def chosen_run(path: Path | None, where: Sequence[str] | None = None) -> Run:
@@ -27,7 +27,7 @@ def chosen_run(path: Path | None, where: Sequence[str] | None = None) -> Run:
         ConfigError: There is no such run, or no such shot.
         RecordingError: It is damaged.
     """
-    from labseq.data import open_run  # with numpy, which commands that only name a run do not need
+    from labseq.data.reader import open_run  # with numpy, which commands that only name a run do not need
 
     return open_run(folder_of_run(path)).select(*where or ())
 

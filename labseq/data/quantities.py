@@ -29,7 +29,7 @@ from labseq.model.image_quantities import (
     measured_in,
     parse_name,
 )
-from labseq.recording.folders import RESULT_PREFIX
+from labseq.recording.folders import RESULT_PREFIX, split_result
 from labseq.recording.index import IndexRow
 from labseq.recording.results import (
     ERROR,
@@ -246,9 +246,9 @@ ANALYSE: Final = "results, which 'labseq analyse' computes where they are missin
 
 def why_no_results(run: Run, name: str) -> str:
     """Why no shot has a result of an analysis that the run's sequence lists; "" for other quantities."""
-    analysis = name.removeprefix(RESULT_PREFIX).partition(".")[0]
+    analysis, _ = split_result(name) or ("", "")
     listed = [one.get("use") for one in (run.record.get("resolved") or {}).get("analysis") or ()]
-    if not name.startswith(RESULT_PREFIX) or analysis not in listed:
+    if analysis not in listed:
         return ""
     rows, _ = read_results(results_file(run.path, analysis))
     if shots_with_result(rows):

@@ -17,7 +17,7 @@ from labseq.data.shot import Shot
 from labseq.errors import RecordingError
 from labseq.model.estimate import Estimated, Rate, mean
 from labseq.model.image_quantities import NO_VALUE, OF_IMAGES, parse_name
-from labseq.recording.folders import RESULT_PREFIX
+from labseq.recording.folders import split_result
 from labseq.recording.index import IndexRow
 from labseq.recording.results import Results, results_file
 
@@ -41,9 +41,8 @@ class Series:
         self._run_dir = run_dir
         self._n, self._n_trials = array("d"), array("d")
         self._of_images = parse_name(quantity.name).kind in OF_IMAGES
-        analysis, _, self._key = quantity.name.removeprefix(RESULT_PREFIX).partition(".")
-        is_result = quantity.name.startswith(RESULT_PREFIX)
-        self._results = Results(results_file(run_dir, analysis)) if is_result else None
+        analysis, self._key = split_result(quantity.name) or ("", "")
+        self._results = Results(results_file(run_dir, analysis)) if analysis else None
         self._waiting: dict[int, int] = {}
 
     def __len__(self) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.errors import RecordingError
 
 __all__ = [

@@ -189,9 +189,9 @@ class QueueRun:
         """Wait while the disk is full: what fills it may go away, and the rest of the night be taken."""
         folder = entry.options.output or self.queue.folder.parent
         is_said = False
-        while free_bytes(folder) < ROOM_BYTES and not self.queue.is_asked_to_stop:
+        while (n_free := free_bytes(folder)) < ROOM_BYTES and not self.queue.is_asked_to_stop:
             if not is_said:
-                what = f"waits: the disk of {visible(str(folder))} has {size_text(free_bytes(folder))} free"
+                what = f"waits: the disk of {visible(str(folder))} has {size_text(n_free)} free"
                 say(f"queue: {what}, and goes on at {size_text(ROOM_BYTES)}", stream=sys.stderr)
             is_said = True
             time.sleep(POLL_S)

@@ -63,6 +63,19 @@ def slug(name: str) -> str:
     return safe[:60].strip("._-") or "run"
 
 
+def split_result(name: str) -> tuple[str, str] | None:
+    """The analysis and the key in the name of a result; None for the name of another quantity.
+
+    Example:
+        >>> split_result("analysis.losses.heating")
+        ('losses', 'heating')
+    """
+    if not name.startswith(RESULT_PREFIX):
+        return None
+    analysis, _, key = name.removeprefix(RESULT_PREFIX).partition(".")
+    return analysis, key
+
+
 def shot_file_name(shot_index: int, attempt: int, *, counts: bool, take: int = 1) -> str:
     """Path of a shot's file, relative to the run's folder.
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from labseq.assembly.point import Point
 from labseq.assembly.quantities import missing_quantity
 from labseq.assembly.search import TO_OPTIMISE, Search
-from labseq.data import Shot
 from labseq.data.columns import quantities_in
 from labseq.data.quantities import make_quantity
+from labseq.data.shot import Shot
 from labseq.errors import DeviceError
 from labseq.model import VisitedPoint
 from labseq.recording.folders import RESULT_PREFIX

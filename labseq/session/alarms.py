@@ -162,16 +162,14 @@ class Alarms:
         """Whether the atoms that the first cycle moved are seen where it moved them."""
         for before, after in pairwise(shot.images) if shot.cycles else ():
             cycle = shot.cycles[0]
-            if (after.step, after.cycle) == (cycle.step, cycle.cycle):
-                moved, _ = follow_atoms(before.occupancy, [cycle])
-                came = moved & ~before.occupancy  # on other sites an atom may be seen although none moved
-                n_moved, n_seen = int(came.sum()), int((came & after.occupancy).sum())
-                if (arrived := self._arrived).add(n_seen, n_moved) < self._settings.arrived:
-                    what = f"{arrived.n} of {arrived.n_of} atoms arrived on sites that were empty"
-                    yield (
-                        "arrived",
-                        f"{what}{arrived.shots}; check light, trigger and overlay of the mobile tweezers",
-                    )
+            if (after.step, after.cycle) != (cycle.step, cycle.cycle):
+                continue
+            moved, _ = follow_atoms(before.occupancy, [cycle])
+            came = moved & ~before.occupancy  # on other sites an atom may be seen although none moved
+            n_moved, n_seen = int(came.sum()), int((came & after.occupancy).sum())
+            if (arrived := self._arrived).add(n_seen, n_moved) < self._settings.arrived:
+                what = f"{arrived.n} of {arrived.n_of} atoms arrived on sites that were empty{arrived.shots}"
+                yield "arrived", f"{what}; check light, trigger and overlay of the mobile tweezers"
 
     def _clock(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
         slept_s, set_s = (shot.readings.get(name, 0.0) for name in (SLEPT, CLOCK_SET))

@@ -24,8 +24,8 @@ import labseq
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_one
 from labseq.assembly.recorded import context_of, plugins_of, resolved_of
 from labseq.config.validation import validate_values
-from labseq.data import Run, open_run
 from labseq.data.follower import Follower
+from labseq.data.reader import Run, open_run
 from labseq.errors import ConfigError, LabseqError, Problem
 from labseq.files import explained
 from labseq.messages import format_plugin_error

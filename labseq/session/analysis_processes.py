@@ -11,12 +11,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.errors import DeviceError, LabseqError
 from labseq.files import check_ordinary, make_folder, share_with_group
 from labseq.guard import StopFlag
 from labseq.messages import clean, did_you_mean, listing
-from labseq.recording.folders import RESULT_PREFIX
+from labseq.recording.folders import RESULT_PREFIX, split_result
 from labseq.recording.results import (
     ERROR,
     SHOT,
@@ -311,5 +311,5 @@ def _flags() -> int:
 
 def _analysis_of(name: str, analyses: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
     """The analysis whose results a quantity is one of."""
-    use = name.removeprefix(RESULT_PREFIX).partition(".")[0]
+    use, _ = split_result(name) or ("", "")
     return next(analysis for analysis in analyses if analysis[USE] == use)

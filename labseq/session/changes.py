@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
 from labseq.assembly.assemble import Assembly
-from labseq.data import Run
+from labseq.data.reader import Run
 from labseq.model import RunRecord
 from labseq.plain import dumps
 from labseq.recording.run_file import encode_run

@@ -15,12 +15,12 @@ from typing import Any, Final, NamedTuple
 
 from labseq.assembly.assemble import Assembly
 from labseq.assembly.fits import find_model
-from labseq.data import open_run
 from labseq.data.fit_models import FitModel
 from labseq.data.fits import Fit
 from labseq.data.points import planned_points
 from labseq.data.precision import follows, read_limit
 from labseq.data.quantities import make_quantity
+from labseq.data.reader import open_run
 from labseq.data.scanned import FitRequest, fits_along, on_axes, request_of
 from labseq.data.series import Series
 from labseq.errors import ConfigError, PluginLoadError, RecordingError

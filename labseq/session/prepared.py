@@ -12,8 +12,8 @@ from typing import Protocol
 from labseq.assembly.assemble import Assembly
 from labseq.assembly.lab import build_lab, clock_for, warm
 from labseq.assembly.point import Point
-from labseq.data import Run, Shot
-from labseq.data.shot import CachingLoader
+from labseq.data.reader import Run
+from labseq.data.shot import CachingLoader, Shot
 from labseq.guard import StopFlag
 from labseq.recording.index import IndexRow
 from labseq.roles import RunObserver

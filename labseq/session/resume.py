@@ -11,7 +11,7 @@ from typing import Final, Self
 from labseq.assembly.assemble import Assembly, assemble_recorded
 from labseq.assembly.options import Options
 from labseq.assembly.recorded import files_of
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import LineLog, explained, write_file
 from labseq.guard import StopFlag
@@ -19,10 +19,10 @@ from labseq.messages import visible
 from labseq.model import RunRecord
 from labseq.plain import now_utc
 from labseq.processes import Lock
-from labseq.recording import RunWriter
 from labseq.recording.folders import INDEX_FILE, LOCK_FILE, RUN_FILE, SOURCES_FILE, find_run
 from labseq.recording.index import IndexRow
 from labseq.recording.run_file import SCANNER, read_owner, read_run, read_state, read_state_file
+from labseq.recording.writer import RunWriter
 from labseq.session.changes import Change, changes_between, code_changes, differences, record_today
 from labseq.session.sources import RunCode
 from labseq.text_files import decode, read_bytes

@@ -15,15 +15,16 @@ from labseq.assembly.assemble import Assembly, assemble
 from labseq.assembly.lab import rebuild_lab
 from labseq.assembly.options import DryRun, Options, path_of
 from labseq.assembly.point import Point
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.errors import ConfigError, DeviceError, RecordingError
 from labseq.guard import stop_on_signals
 from labseq.messages import error_text, visible
 from labseq.model import RunRecord, ShotRecord
 from labseq.realtime import real_time
-from labseq.recording import RunWriter, clear_active, data_root, find_dead_run, mark_active
+from labseq.recording import clear_active, data_root, find_dead_run, mark_active
 from labseq.recording.folders import NOTIFY_FILE, SOURCES_FILE, later_day
 from labseq.recording.index import IndexRow
+from labseq.recording.writer import RunWriter
 from labseq.roles import RunObserver
 from labseq.safety.locks import lock_devices
 from labseq.sequencer.clock import ClockJumps

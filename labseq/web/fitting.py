@@ -10,10 +10,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from labseq.data import Run
 from labseq.data.fits import Parameter
 from labseq.data.numbers import readable
 from labseq.data.quantities import Quantity
+from labseq.data.reader import Run
 from labseq.data.scanned import FitAt, Scanned, fits_along, request_of
 from labseq.errors import ConfigError
 from labseq.messages import format_error

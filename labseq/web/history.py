@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.analysis.statistics import LOST
-from labseq.data import Shot
 from labseq.data.follower import Follower
 from labseq.data.series import Series
 from labseq.errors import RecordingError
@@ -80,9 +79,6 @@ class RunHistory:
             for series in self._series:
                 series.read_results()
 
-    def _shot_of(self, line: int) -> Shot:
-        return self._follower.shot(self._row(line))
-
     def _add(self, row: IndexRow, start: int) -> None:
         n = len(self._shot)
         if row.counts:  # the last line counts if a shot was written twice
@@ -121,10 +117,7 @@ class RunHistory:
             RecordingError: It cannot be read.
         """
         with self._lock:
-            return self._row(line)
-
-    def _row(self, line: int) -> IndexRow:
-        row = _row_of(next(lines_in(self._path, self._start[line]), b""))
+            row = _row_of(next(lines_in(self._path, self._start[line]), b""))
         if row is None:
             raise RecordingError(self._path, "has a damaged line", "`labseq doctor` reports them")
         return row

@@ -14,12 +14,13 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Final, cast
 
-from labseq.data import Run, Shot
 from labseq.data.catalogue import entries
 from labseq.data.follower import Event, Follower
 from labseq.data.points import reporting_damage
 from labseq.data.quantities import WITH_TARGET, make_quantity, names_measured, quantity_problem
+from labseq.data.reader import Run
 from labseq.data.series import Series
+from labseq.data.shot import Shot
 from labseq.errors import RecordingError
 from labseq.messages import visible
 from labseq.model import TargetPattern

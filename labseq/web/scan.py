@@ -7,11 +7,12 @@ import math
 import time
 from typing import Any, Final
 
-from labseq.data import Shot, open_run
 from labseq.data.points import ScanPoint
 from labseq.data.quantities import column_names, find_quantity, image_names, make_quantity, measures_of
+from labseq.data.reader import open_run
 from labseq.data.scanned import Scanned, scanned
 from labseq.data.series import Series
+from labseq.data.shot import Shot
 from labseq.errors import LabseqError
 from labseq.model.estimate import Estimated
 from labseq.model.image_quantities import OF_IMAGES, parse_name

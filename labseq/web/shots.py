@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from labseq.data import Shot
+from labseq.data.shot import Shot
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, ImageRecord, TargetPattern
 from labseq.plain import to_plain

@@ -16,8 +16,8 @@ from labseq.analysis.timing import StageTotals
 from labseq.calibration_store import read_entry
 from labseq.console.events import event_text, point_of_shot
 from labseq.console.text import age_text, plural
-from labseq.data import Shot
 from labseq.data.follower import Event
+from labseq.data.shot import Shot
 from labseq.errors import ConfigError, LabseqError, RecordingError
 from labseq.files import free_bytes
 from labseq.model import StageTiming

@@ -210,7 +210,6 @@ class TweezerImageSettings(Settings):
 
 PositiveTemperature = Annotated[Temperature, Field(gt=0)]
 NonNegativeLength = Annotated[Length, Field(ge=0)]
-NonNegativeTemperature = Annotated[Temperature, Field(ge=0)]
 
 
 class ToneComb(Settings):

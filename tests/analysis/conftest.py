@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 import labseq
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.model import ShotRecord
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 from .records import make_run
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from labseq.data import Run
+from labseq.data.reader import Run
 from labseq.model import (
     CycleRecord,
     Frame,

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from labseq.analysis.comparison import Compared
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.files import write_file
 
 DAYS = ("2026-11-20", "2026-11-21", "2026-11-28")

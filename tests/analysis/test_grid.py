@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from labseq.analysis.overview import grid_of, sites_of
 from labseq.calibration_store import encode_entry
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.model import CalibrationEntry, SiteGrid
 from labseq.model.calibration import grid_facts
 from labseq.recording.schema import RUN_FORMAT_VERSION

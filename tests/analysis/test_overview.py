@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from labseq.analysis.overview import RunPicture, overview, picture_of
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.errors import ConfigError
 from labseq.pictures.figures import make_figure
 

@@ -11,7 +11,7 @@ import pytest
 
 from labseq.analysis.charts import draw_curves, draw_map
 from labseq.analysis.overview import overview, picture_of
-from labseq.data import Run
+from labseq.data.reader import Run
 from labseq.units import parse_any
 
 from .records import make_shot

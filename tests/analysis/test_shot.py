@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from labseq.analysis.shot import DPI, ShotDrawing, ShotPanel, save_shot, shot_picture
-from labseq.data import Run
+from labseq.data.reader import Run
 from labseq.errors import ConfigError
 from labseq.model import SiteGrid, TargetPattern
 from labseq.pictures.figures import HEAD_IN

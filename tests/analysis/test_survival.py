@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from labseq.analysis.statistics import Survival
-from labseq.data import Run
 from labseq.data.quantities import steps_that_load
+from labseq.data.reader import Run
 from labseq.errors import RecordingError
 from labseq.model import CycleRecord, Plan, PlanReport, follow_atoms
 from labseq.model.estimate import Rate

@@ -12,7 +12,7 @@ from hypothesis import given, strategies as st
 
 from labseq.analysis.overview import evenly
 from labseq.analysis.timing import quantiles, timing_of, writing_s
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 
 from .records import make_shot
 

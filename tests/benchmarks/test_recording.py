@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from labseq.data import open_run
+from labseq.data.reader import open_run
 from labseq.model import (
     CycleRecord,
     Frame,
@@ -22,7 +22,7 @@ from labseq.model import (
     StageTiming,
     TargetPattern,
 )
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 START = "2026-11-20T10:00:00.000000+00:00"
 GRID = (20, 20)

@@ -25,7 +25,7 @@ from urllib.request import urlopen
 import numpy as np
 import psutil
 
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.plain import dumps
 
 ROOT = Path(__file__).parents[2]
@@ -37,8 +37,8 @@ WRITE = """
 import sys, time
 from dataclasses import replace
 from pathlib import Path
-from labseq.data import open_run
-from labseq.recording import RunWriter
+from labseq.data.reader import open_run
+from labseq.recording.writer import RunWriter
 from tests.recording.records import make_run
 source, root = open_run(sys.argv[1]), Path(sys.argv[2])
 n_shots, interval_s = int(sys.argv[3]), float(sys.argv[4])

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from labseq.cli.data import MAX_ROWS
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from typing import Any
 import h5py
 import pytest
 
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 
 @pytest.fixture

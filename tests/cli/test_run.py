@@ -15,9 +15,9 @@ from labseq.assembly.options import Options
 from labseq.cli.run import run_sequence
 from labseq.cli.summary import Summary
 from labseq.console.output import discard_unwritten
-from labseq.data import open_run
+from labseq.data.reader import open_run
 from labseq.errors import ConfigError, DeviceError, Problem, RecordingError, StopRequested
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 NOTHING = {"run_dir": None, "shots": 0, "defect_free": None, "filling_fraction": None}
 

@@ -13,8 +13,8 @@ import pytest
 import labseq
 from labseq.console.runs import folder_of_run
 from labseq.data import described
-from labseq.recording import RunWriter
 from labseq.recording.notes import Notes, write_notes
+from labseq.recording.writer import RunWriter
 
 DAYS = ("2026-01-02", "2026-01-03")
 

@@ -14,11 +14,11 @@ from labseq.analysis.scanned import ScanRequest
 from labseq.cli.show import Tables, show_run
 from labseq.cli.summary import MAX_ROWS, Summary
 from labseq.console.report import aligned
-from labseq.data import open_run
+from labseq.data.reader import open_run
 from labseq.errors import ConfigError
 from labseq.model import StageTiming
-from labseq.recording import RunWriter
 from labseq.recording.listing import newest_run
+from labseq.recording.writer import RunWriter
 
 NO_TERMINAL = pytest.mark.usefixtures("capsys")
 """Tables are as wide as the terminal."""

@@ -12,9 +12,9 @@ import pytest
 
 from labseq.cli.live import Tally
 from labseq.cli.watch import watch_run
-from labseq.data import open_run
 from labseq.data.follower import Follower
-from labseq.recording import RunWriter
+from labseq.data.reader import open_run
+from labseq.recording.writer import RunWriter
 
 
 class WrittenRun:

@@ -19,7 +19,7 @@ import numpy as np
 from labseq.assembly.assemble import assemble
 from labseq.assembly.options import Options
 from labseq.calibration_store import encode_entry, read_entry, stem_of
-from labseq.data import open_run
+from labseq.data.reader import open_run
 from labseq.errors import LabseqError
 from labseq.model import SiteGrid
 from labseq.plans.plan_file import parse_plan

@@ -17,7 +17,7 @@ from PIL import Image
 
 from labseq.model import ImageRecord, RunRecord, ShotRecord, TargetPattern
 from labseq.plugin import ConfigError, Context, DeviceError, Frame
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 from labseq.testing import CameraContract
 from labseq.testing.fakes import FakeClock
 

@@ -20,7 +20,7 @@ from labseq_serial.device import SerialDevice
 from labseq import ConfigError, DeviceError, LimitError, Session, TransientError
 from labseq.config.find import find_profile
 from labseq.config.yaml_nodes import compose
-from labseq.data import Run
+from labseq.data.reader import Run
 from labseq.plugin import Context
 from labseq.safety.devices import check_devices
 from labseq.session.check import check

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from labseq.assembly.calibrations import open_store
-from labseq.data import open_run
+from labseq.data.reader import open_run
 from labseq.errors import ConfigError, RecordingError, StopRequested
 from labseq.model import CalibrationEntry, SiteGrid, grid_facts
 from labseq.plain import now_utc

@@ -11,8 +11,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from labseq.recording import RunWriter
 from labseq.recording.doctor import Report
+from labseq.recording.writer import RunWriter
 
 from .records import make_run, make_shot
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from labseq.data import Run, open_run
+from labseq.data.reader import Run, open_run
 from labseq.model import (
     CycleRecord,
     Frame,
@@ -22,7 +22,7 @@ from labseq.model import (
     TargetPattern,
 )
 from labseq.model.records import LineEdge
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 START = "2026-11-20T10:00:00.000000+00:00"
 SHAPE = (4, 5)

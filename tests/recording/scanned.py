@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 from .records import make_run, make_shot
 

@@ -18,9 +18,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from labseq.data import open_run
-from labseq.recording import RunWriter, doctor, mark_active
+from labseq.data.reader import open_run
+from labseq.recording import doctor, mark_active
 from labseq.recording.doctor import examine
+from labseq.recording.writer import RunWriter
 from tests.locking import held_elsewhere
 
 from .damages import (

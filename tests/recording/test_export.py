@@ -14,10 +14,10 @@ import pandas as pd
 import pytest
 import xarray
 
-from labseq.data import Run, open_run
 from labseq.data.export import ENDINGS, check_export, export_run
+from labseq.data.reader import Run, open_run
 from labseq.errors import ConfigError
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 from .records import make_run, make_shot, write
 from .scanned import ADDRESSES, POINTS, write_scan

@@ -10,7 +10,7 @@ import pytest
 
 from labseq.data.follower import Follower
 from labseq.files import NewLines
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 from .records import make_run, make_shot
 

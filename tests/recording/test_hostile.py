@@ -15,10 +15,10 @@ import h5py
 import numpy as np
 import pytest
 
-from labseq.data import open_run
 from labseq.data.columns import columns_of
 from labseq.data.export import export_run
 from labseq.data.follower import Follower
+from labseq.data.reader import open_run
 from labseq.errors import RecordingError
 from labseq.recording.doctor import examine
 from labseq.recording.shot_file import read_content, read_frames, read_occupancies

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq.data import open_run
+from labseq.data.reader import open_run
 from labseq.recording.doctor import examine
 
 WRITE_FOR_EVER = """
@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from labseq.model import Frame, ImageRecord, RunRecord, ShotRecord, TargetPattern
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 start = "2026-11-20T10:00:00.000000+00:00"
 sites = np.ones((4, 5), np.bool_)

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from labseq.data import open_run
 from labseq.data.best import best_point
 from labseq.data.points import scan_points
+from labseq.data.reader import open_run
 from labseq.errors import RecordingError
 from labseq.model import ScanRange
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 from .records import make_run, make_shot
 

@@ -14,9 +14,9 @@ import h5py
 import numpy as np
 import pytest
 
-from labseq.data import open_run
+from labseq.data.reader import open_run
 from labseq.errors import RecordingError
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 from .records import make_run, make_shot, write
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labseq.data import open_run
+from labseq.data.reader import open_run
 from labseq.errors import RecordingError
-from labseq.recording import RunWriter
 from labseq.recording.results import ResultsLog, read_results, results_file, rows_of, shots_with_result
+from labseq.recording.writer import RunWriter
 
 from .records import make_run
 

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from labseq.data import open_run
 from labseq.data.images import average_frame
+from labseq.data.reader import open_run
 from labseq.errors import RecordingError
 from labseq.messages import install_hint
 from labseq.model import (
@@ -31,7 +31,7 @@ from labseq.model import (
     TargetPattern,
 )
 from labseq.plain import dumps
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 from .records import assert_same, make_run, make_shot, write
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from labseq.analysis.statistics import statistics_of
-from labseq.data import Run, open_run
 from labseq.data.best import best_shot
+from labseq.data.reader import Run, open_run
 from labseq.model import CycleRecord, ImageRecord, Plan, PlanReport, ShotRecord
 from labseq.model.estimate import Rate
 from labseq.plain import to_plain
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 from .records import make_run, make_shot
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from labseq.data import Run, open_run
 from labseq.data.columns import columns_of
+from labseq.data.reader import Run, open_run
 from labseq.errors import ConfigError, RecordingError
 from labseq.messages import install_hint
-from labseq.recording import RunWriter
+from labseq.recording.writer import RunWriter
 
 from .records import make_run, make_shot, write
 from .scanned import ADDRESSES, DEGREES, N_REPEATS, WINDOWS_S, write_scan

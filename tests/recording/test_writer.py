@@ -18,12 +18,12 @@ from typing import Any
 
 import pytest
 
-from labseq.data import open_run
+from labseq.data.reader import open_run
 from labseq.errors import RecordingError
 from labseq.files import explained
 from labseq.model import RunRecord
-from labseq.recording import RunWriter
 from labseq.recording.results import ResultsLog
+from labseq.recording.writer import RunWriter
 
 from .records import make_run, make_shot
 

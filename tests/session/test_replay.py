@@ -12,7 +12,7 @@ import pytest
 import labseq
 from labseq.analysis.replay import ReplayRequest, replay, shots_of
 from labseq.calibration_store import Store
-from labseq.data import open_run
+from labseq.data.reader import open_run
 from labseq.errors import ConfigError, RecordingError
 from labseq.files import packaged_profiles_dir
 from labseq.model import SiteGrid

@@ -15,8 +15,8 @@ from numpy.testing import assert_allclose
 
 from labseq.analysis.statistics import statistics_of
 from labseq.calibration_store import encode_entry
-from labseq.data import open_run
 from labseq.data.follower import Follower
+from labseq.data.reader import open_run
 from labseq.files import write_file
 from labseq.model import CalibrationEntry, SiteGrid, grid_facts
 from labseq.model.estimate import mean

@@ -24,7 +24,7 @@ from PIL import Image
 
 import labseq
 from labseq.calibration_store import Store
-from labseq.data import open_run
+from labseq.data.reader import open_run
 from labseq.model import CalibrationEntry, SiteGrid, grid_facts
 from labseq.queue.queue import Queue
 from tests.recording.records import make_shot

@@ -13,8 +13,8 @@ import pytest
 
 import labseq
 from labseq.analysis.scanned import ScanRequest, scan_report
-from labseq.data import open_run
 from labseq.data.quantities import find_quantity
+from labseq.data.reader import open_run
 from labseq.data.scanned import FitRequest
 from labseq.model import ShotRecord, TargetPattern
 from labseq.model.estimate import Rate
