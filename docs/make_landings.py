@@ -22,7 +22,7 @@ import numpy as np
 from labseq_virtual.flight import Conditions, machine
 from labseq_virtual.flight_kernels import fly_in_light
 from labseq_virtual.formulas import KELVIN
-from labseq_virtual.records import FATES, SITE
+from labseq_virtual.records import FATES, SITE, plane_of
 from labseq_virtual.settings import SimulationSettings
 from numpy.typing import NDArray
 
@@ -67,7 +67,7 @@ def follow(path: TweezerPath, rng: np.random.Generator) -> Floats:
     sites = np.zeros((1, GROUP), SITE)
     sites["atom"], sites["depth"], sites["heat"] = True, KELVIN * STATIC.static_depth, path.temperature_k
     down, right = np.array([0.0, 2 * HALF_M]), np.array([APART_M, 0.0])
-    plane = np.vstack([np.zeros(2), down, right, np.linalg.inv(np.stack([down, right], axis=1))])
+    plane = plane_of(np.zeros(2), down, right)
     columns = np.tile(np.arange(float(GROUP))[:, None] + path.beside_m / APART_M, len(path.along_m))
     light = SimulationSettings().mobile_light.model_copy(update={"depth": path.depth_k})
     numbers = machine(
@@ -75,7 +75,7 @@ def follow(path: TweezerPath, rng: np.random.Generator) -> Floats:
     )
     fly_in_light(
         sites, path.along_m[None] / (2 * HALF_M), path.fraction[None].copy(), columns, np.ones_like(columns),
-        0.0, FRAME_S, numbers, np.ascontiguousarray(plane), rng, np.zeros(len(FATES), np.int64),
+        0.0, FRAME_S, numbers, plane, rng, np.zeros(len(FATES), np.int64),
     )  # fmt: skip
     return np.where(sites["atom"][0], sites["heat"][0], np.nan)
 

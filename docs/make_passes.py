@@ -22,7 +22,7 @@ from labseq_grid.planner import WEAVE
 from labseq_virtual.flight import Conditions, machine
 from labseq_virtual.flight_kernels import fly_in_light
 from labseq_virtual.formulas import KELVIN
-from labseq_virtual.records import FATES, SITE
+from labseq_virtual.records import FATES, SITE, plane_of
 from labseq_virtual.settings import SimulationSettings
 
 from labseq.model import MotionSpec
@@ -54,7 +54,7 @@ def n_taken(
     sites = np.zeros((1, GROUP), SITE)
     sites["atom"], sites["depth"], sites["heat"] = True, KELVIN * STATIC.static_depth, temperature_k
     down, right = np.array([0.0, REACH_M]), np.array([APART_M, 0.0])
-    plane = np.vstack([np.zeros(2), down, right, np.linalg.inv(np.stack([down, right], axis=1))])
+    plane = plane_of(np.zeros(2), down, right)
     n_frames = round(2 * REACH_M / MotionSpec().speed_m_s / FRAME_S)
     rows = np.linspace(1.0, -1.0, n_frames + 1)[None]
     swing = swing_m * np.cos(2 * math.pi * REACH_M / SPACING_M * rows)
@@ -65,7 +65,7 @@ def n_taken(
     )
     fly_in_light(
         sites, rows, np.ones_like(rows), columns, np.ones_like(columns), 0.0, FRAME_S, numbers,
-        np.ascontiguousarray(plane), rng, np.zeros(len(FATES), np.int64),
+        plane, rng, np.zeros(len(FATES), np.int64),
     )  # fmt: skip
     return GROUP - int(sites["atom"].sum())
 

@@ -1,6 +1,6 @@
 """Kernels of an atom in the light of Gaussian beams: its energy, its start, and its motion.
 
-Energies and depths are per mass, in m^2/s^2. An ``atom`` is its position (m) and velocity (m/s), (6,). Atoms
+Energies and depths are per mass, in m^2/s^2. Atoms
 of a batch are integrated in single precision, several at once, so that the compiler uses the processor's
 vector instructions: they are the *lanes* of a flat array.
 """
@@ -8,12 +8,13 @@ vector instructions: they are the *lanes* of a flat array.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import const, helper_kernel, kernel
+from labseq_virtual.records import ATOM, Atom
 
 Floats = NDArray[np.float64]
 
@@ -77,10 +78,10 @@ def pull(
 
 
 @helper_kernel()
-def energy_in(atom: Floats, x: float, y: float, depth: float, waist: float, rayleigh: float) -> float:
+def energy_in(atom: Atom, x: float, y: float, depth: float, waist: float, rayleigh: float) -> float:
     """Energy of an atom in one tweezer at a place, negative if that binds it."""
-    kinetic = 0.5 * (atom[3] * atom[3] + atom[4] * atom[4] + atom[5] * atom[5])
-    return kinetic + pull(atom[0] - x, atom[1] - y, atom[2], depth, waist, rayleigh)[3]
+    kinetic = 0.5 * (atom.vx * atom.vx + atom.vy * atom.vy + atom.vz * atom.vz)
+    return kinetic + pull(atom.x - x, atom.y - y, atom.z, depth, waist, rayleigh)[3]
 
 
 LANES: Final = 8
@@ -158,7 +159,7 @@ LONGER = 4.0
 
 
 @helper_kernel()
-def draw_place(most: float, atom: Floats, rng: np.random.Generator) -> float:
+def draw_place(most: float, atom: Atom, rng: np.random.Generator) -> float:
     """Draw a position in units of waist and Rayleigh length; returns -U / kT there. See ``draw_atoms``."""
     across, along = WIDER / math.sqrt(4.0 * most), LONGER / math.sqrt(2.0 * most)
     while True:
@@ -168,23 +169,23 @@ def draw_place(most: float, atom: Floats, rng: np.random.Generator) -> float:
         a = most / s * math.exp(-2.0 * (x * x + y * y) / s)
         part = rng.random() / math.exp(a - most + 0.5 * (nx * nx + ny * ny + nz * nz))
         if part < 1.0 and part < math.erf(math.sqrt(a)) - 2.0 * math.sqrt(a / math.pi) * math.exp(-a):
-            atom[0], atom[1], atom[2] = x, y, z
+            atom.x, atom.y, atom.z = x, y, z
             return a
 
 
 @helper_kernel()
 def draw_atom(
-    atom: Floats, depth: float, kt: float, waist: float, rayleigh: float, rng: np.random.Generator
+    atom: Atom, depth: float, kt: float, waist: float, rayleigh: float, rng: np.random.Generator
 ) -> None:
     """Draw one atom at the origin, as :func:`draw_atoms` does; ``kt`` is per mass."""
     kt = min(kt, 0.5 * depth)
     bound = draw_place(depth / kt, atom, rng)
-    atom[0], atom[1], atom[2] = waist * atom[0], waist * atom[1], rayleigh * atom[2]
+    atom.x, atom.y, atom.z = waist * atom.x, waist * atom.y, rayleigh * atom.z
     while True:
         vx, vy, vz = rng.standard_normal(), rng.standard_normal(), rng.standard_normal()
         if 0.5 * (vx * vx + vy * vy + vz * vz) < bound:
             fast = math.sqrt(kt)
-            atom[3], atom[4], atom[5] = fast * vx, fast * vy, fast * vz
+            atom.vx, atom.vy, atom.vz = fast * vx, fast * vy, fast * vz
             return
 
 
@@ -208,9 +209,11 @@ def draw_atoms(depth: Floats, kt: Floats, waist: float, rayleigh: float, rng: np
     Returns:
         Positions relative to the tweezers' foci, and velocities, (n_atoms, 6).
     """
-    atoms = np.empty((len(depth), 6))
+    atoms, drawn = np.empty((len(depth), 6)), np.empty(1, ATOM)
+    atom: Any = drawn[0]
     for i in range(len(depth)):
-        draw_atom(atoms[i], depth[i], kt[i], waist, rayleigh, rng)
+        draw_atom(atom, depth[i], kt[i], waist, rayleigh, rng)
+        atoms[i] = np.array([atom.x, atom.y, atom.z, atom.vx, atom.vy, atom.vz])
     return atoms
 
 
@@ -244,5 +247,6 @@ def ramp_atoms(
             vx, vy, vz = vx + dt * ax, vy + dt * ay, vz + dt * az
             x, y, z = x + 0.5 * dt * vx, y + 0.5 * dt * vy, z + 0.5 * dt * vz
         state[i] = np.array([x, y, z, vx, vy, vz])
-        energy[i] = energy_in(state[i], 0.0, 0.0, end * depth[i], waist, rayleigh)
+        kinetic = 0.5 * (vx * vx + vy * vy + vz * vz)
+        energy[i] = kinetic + pull(x, y, z, end * depth[i], waist, rayleigh)[3]
     return energy

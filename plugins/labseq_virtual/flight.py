@@ -32,7 +32,7 @@ from labseq_virtual.formulas import (
     rayleigh_length,
 )
 from labseq_virtual.jumps import JUMPS, find_jumps
-from labseq_virtual.records import FATES, SITE, TONE
+from labseq_virtual.records import FATES, SITE, TONE, plane_of
 from labseq_virtual.rf_analysis import (
     WINDOW,
     RfPulse,
@@ -148,8 +148,7 @@ class Flights:
         row_hz, col_hz = (float(np.abs(np.diff(hz)).mean()) if len(hz) > 1 else 0.0 for hz in axes_hz)
         self._step_hz = row_hz, col_hz
         a1, a2 = grid.axes
-        inverse = np.linalg.inv(np.stack([a2, a1], axis=1))
-        self._plane = np.ascontiguousarray(np.vstack([grid.positions_m[0, 0], a2, a1, inverse]))
+        self._plane = plane_of(grid.positions_m[0, 0], a2, a1)
         self.margin_s = (WINDOW + 0.5) * light.transit_time
         self._flights: list[NDArray[Any]] = []
         self._jumps: list[tuple[Any, ...]] = []

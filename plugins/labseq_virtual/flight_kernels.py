@@ -2,9 +2,8 @@
 
 Energies and depths are per mass, in m^2/s^2. Arguments that occur in several kernels:
 
-- ``atom``: position (m) and velocity (m/s), (6,).
-- ``plane``: position of site (0, 0), step from row to row, step from column to column, in m; then
-  the inverse of the steps, so that ``plane[3:] @ (x, y)`` is in sites (5, 2).
+- ``atom``: position and velocity, :class:`labseq_virtual.records.Atom`.
+- ``plane``: where the sites are, :class:`labseq_virtual.records.Plane`.
 - ``rows``, ``cols``: the tones from frame to frame, :func:`labseq_virtual.light_kernels.course_of`.
 - ``flights``, ``state``: the atoms near which a tweezer came so far, :class:`Flight` and ``atom`` of each.
 - ``sites``: the sites and their atoms, ``Site`` (n_rows, n_cols).
@@ -60,15 +59,15 @@ from labseq_virtual.light_kernels import (
     find_batches,
     light_of_axis,
 )
-from labseq_virtual.records import SITE, TONE, Site, record, signature
+from labseq_virtual.records import ATOM, SITE, TONE, Atom, Plane, Site, record, signature
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Records = Any
 """An array of records: numpy has no type for one that knows its columns."""
 
-NEAR = 3.0
-"""Distance in waists beyond which a tweezer is neglected: there it has 2e-8 of its depth."""
+NEAR = 2.6
+"""Distance in waists beyond which a tweezer is neglected: there it has 1.4e-6 of its depth."""
 GONE = 2.0
 """Distance in waists from every tweezer beyond which an unbound atom counts as lost (ours)."""
 HIGH = 4.0
@@ -139,23 +138,23 @@ FLIGHT: Final = record(Flight)
 
 
 @helper_kernel()
-def sites_of(x: float, y: float, plane: Floats) -> tuple[float, float]:
+def sites_of(x: float, y: float, plane: Plane) -> tuple[float, float]:
     """Row and column of a place, in sites."""
-    x, y = x - plane[0, 0], y - plane[0, 1]
-    return plane[3, 0] * x + plane[3, 1] * y, plane[4, 0] * x + plane[4, 1] * y
+    x, y = x - plane.x, y - plane.y
+    return plane.row_x * x + plane.row_y * y, plane.col_x * x + plane.col_y * y
 
 
 @helper_kernel()
-def place_of(row: float, col: float, plane: Floats) -> tuple[float, float]:
+def place_of(row: float, col: float, plane: Plane) -> tuple[float, float]:
     """Place of a row and column, in metres."""
-    x = plane[0, 0] + row * plane[1, 0] + col * plane[2, 0]
-    return x, plane[0, 1] + row * plane[1, 1] + col * plane[2, 1]
+    x = plane.x + row * plane.x_row + col * plane.x_col
+    return x, plane.y + row * plane.y_row + col * plane.y_col
 
 
 @helper_kernel()
-def site_at(atom: Floats, plane: Floats, shape: tuple[int, int]) -> tuple[int, int, bool]:
+def site_at(atom: Atom, plane: Plane, shape: tuple[int, int]) -> tuple[int, int, bool]:
     """Row and column of the site nearest to an atom, and whether the atom is in the grid."""
-    at_row, at_col = sites_of(atom[0], atom[1], plane)
+    at_row, at_col = sites_of(atom.x, atom.y, plane)
     row, col = round(at_row), round(at_col)
     inside = 0 <= row < shape[0] and 0 <= col < shape[1]
     return min(max(row, 0), shape[0] - 1), min(max(col, 0), shape[1] - 1), inside
@@ -184,16 +183,16 @@ def nearest(tones: Floats, k: int, last: int, place: float, guess: int) -> int:
 
 @helper_kernel()
 def find_tweezer(
-    flight: Flight, atom: Floats, rows: Floats, cols: Floats, k: int, last: int, plane: Floats, reach: float
+    flight: Flight, atom: Atom, rows: Floats, cols: Floats, k: int, last: int, plane: Plane, reach: float
 ) -> bool:
     """Find the mobile tweezer nearest to an atom between two frames; whether one is near."""
-    row, col = sites_of(atom[0], atom[1], plane)
+    row, col = sites_of(atom.x, atom.y, plane)
     flight.row = nearest(rows, k, last, row, flight.row)
     flight.col = nearest(cols, k, last, col, flight.col)
     if flight.row >= 0 and flight.col >= 0:
         for frame in (k, last):
             x, y = place_of(rows[flight.row, frame, PLACE], cols[flight.col, frame, PLACE], plane)
-            if square(x - atom[0], y - atom[1]) < reach * reach:  # never for nan
+            if square(x - atom.x, y - atom.y) < reach * reach:  # never for nan
                 return True
     flight.row = flight.col = -1
     return False
@@ -209,7 +208,7 @@ def relaxed(heat: float, elapsed_s: float, aim: float, machine: Machine) -> floa
 
 @helper_kernel()
 def wake(
-    flight: Flight, atom: Floats, row: int, col: int, site: Site, now_s: float, plane: Floats,
+    flight: Flight, atom: Atom, row: int, col: int, site: Site, now_s: float, plane: Plane,
     machine: Machine, rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """Draw where the atom of a site is in its static tweezer, and how it moves, as a mobile tweezer comes."""
@@ -219,8 +218,8 @@ def wake(
     draw_atom(atom, site.depth, KELVIN * flight.heat * level, waist, rayleigh, rng)
     flight.energy = (energy_in(atom, 0.0, 0.0, site.depth, waist, rayleigh) + site.depth) / level
     x, y = place_of(row, col, plane)
-    atom[0] += x
-    atom[1] += y
+    atom.x += x
+    atom.y += y
     site.atom = False
     flight.fate, flight.row, flight.col = FLYING, -1, -1
     flight.from_row, flight.from_col, flight.to_row, flight.to_col = row, col, row, col
@@ -231,8 +230,8 @@ def wake(
 
 @helper_kernel()
 def wake_around(
-    row: float, col: float, flights: Records, state: Floats, n: int, awake: Ints, block: int, sites: Records,
-    now_s: float, plane: Floats, machine: Machine, rng: np.random.Generator,
+    row: float, col: float, flights: Records, state: Records, n: int, awake: Ints, block: int, sites: Records,
+    now_s: float, plane: Plane, machine: Machine, rng: np.random.Generator,
 ) -> int:  # fmt: skip
     """Wake the atoms on the sites around a mobile tweezer; returns the number of flights."""
     x, y = place_of(row, col, plane)
@@ -251,8 +250,8 @@ def wake_around(
 
 @helper_kernel()
 def wake_atoms(
-    rows: Floats, cols: Floats, k: int, last: int, flights: Records, state: Floats, n: int, awake: Ints,
-    sites: Records, now_s: float, plane: Floats, machine: Machine, rng: np.random.Generator,
+    rows: Floats, cols: Floats, k: int, last: int, flights: Records, state: Records, n: int, awake: Ints,
+    sites: Records, now_s: float, plane: Plane, machine: Machine, rng: np.random.Generator,
 ) -> int:  # fmt: skip
     """Wake the atoms on all sites that mobile tweezers are near between two frames.
 
@@ -286,12 +285,10 @@ def wake_atoms(
 
 @helper_kernel()
 def must_move(
-    flight: Flight, atom: Floats, rows: Floats, cols: Floats, k: int, last: int, awake: Ints, sites: Records,
-    plane: Floats, machine: Machine,
+    flight: Flight, atom: Atom, rows: Floats, cols: Floats, k: int, last: int, sites: Records, plane: Plane,
+    machine: Machine,
 ) -> bool:  # fmt: skip
     """Whether an atom must be integrated from frame k to ``last``; one that need not settles."""
-    if flight.fate < FLYING or (flight.fate == SETTLED and awake[flight.to_row, flight.to_col] < last):
-        return False
     if find_tweezer(flight, atom, rows, cols, k, last, plane, NEAR * machine.mobile_waist):
         flight.fate = FLYING
         return True
@@ -305,28 +302,29 @@ def must_move(
 
 
 @helper_kernel()
-def set_tweezer(
-    lanes: NDArray[np.float32], i: int, flight: Flight, rows: Floats, cols: Floats, k: int, x: float,
-    y: float, plane: Floats,
+def set_tweezers(
+    lanes: NDArray[np.float32], origin: Floats, moving: Ints, flights: Records, rows: Floats, cols: Floats,
+    k: int, plane: Plane,
 ) -> None:  # fmt: skip
-    """Fill in the mobile tweezer of lane i from frame k to the next, relative to (x, y)."""
-    if flight.row < 0:
-        return  # its depth is 0
-    row, col = rows[flight.row, k], cols[flight.col, k]
-    lanes[ROW + i], lanes[ROW_CHANGE + i] = row[DEPTH], row[CHANGE]
-    lanes[COL + i], lanes[COL_CHANGE + i] = col[DEPTH], col[CHANGE]
-    if math.isnan(row[PLACE]) or math.isnan(col[PLACE]):
-        return  # likewise
-    at_x, at_y = place_of(row[PLACE], col[PLACE], plane)
-    lanes[AWAY_X + i], lanes[AWAY_Y + i] = at_x - x, at_y - y
-    lanes[WAY_X + i] = row[WAY] * plane[1, 0] + col[WAY] * plane[2, 0]
-    lanes[WAY_Y + i] = row[WAY] * plane[1, 1] + col[WAY] * plane[2, 1]
+    """Fill in the mobile tweezers of the lanes from frame k to the next, relative to the origins."""
+    for i in range(len(moving)):
+        r, c = flights[moving[i]].row, flights[moving[i]].col
+        if r < 0:
+            continue  # its depth is 0
+        lanes[ROW + i], lanes[ROW_CHANGE + i] = rows[r, k, DEPTH], rows[r, k, CHANGE]
+        lanes[COL + i], lanes[COL_CHANGE + i] = cols[c, k, DEPTH], cols[c, k, CHANGE]
+        x, y = place_of(rows[r, k, PLACE], cols[c, k, PLACE], plane)
+        if math.isnan(x) or math.isnan(y):
+            continue  # likewise
+        lanes[AWAY_X + i], lanes[AWAY_Y + i] = x - origin[i, 0], y - origin[i, 1]
+        lanes[WAY_X + i] = rows[r, k, WAY] * plane.x_row + cols[c, k, WAY] * plane.x_col
+        lanes[WAY_Y + i] = rows[r, k, WAY] * plane.y_row + cols[c, k, WAY] * plane.y_col
 
 
 @helper_kernel()
 def move_some(
-    lanes: NDArray[np.float32], origin: Floats, moving: Ints, state: Floats, flights: Records, rows: Floats,
-    cols: Floats, k: int, last: int, n_steps: int, sites: Records, frame_s: float, plane: Floats,
+    lanes: NDArray[np.float32], origin: Floats, moving: Ints, state: Records, flights: Records, rows: Floats,
+    cols: Floats, k: int, last: int, n_steps: int, sites: Records, frame_s: float, plane: Plane,
     machine: Machine,
 ) -> None:  # fmt: skip
     """Move as many atoms as there are lanes, or fewer, from frame k to ``last``."""
@@ -336,28 +334,26 @@ def move_some(
         row, col, _ = site_at(atom, plane, sites.shape)
         origin[i, 0], origin[i, 1] = place_of(row, col, plane)
         lanes[STATIC + i] = sites[row, col].depth
-        lanes[X + i], lanes[Y + i], lanes[Z + i] = atom[0] - origin[i, 0], atom[1] - origin[i, 1], atom[2]
-        lanes[VX + i], lanes[VY + i], lanes[VZ + i] = atom[3], atom[4], atom[5]
+        lanes[X + i], lanes[Y + i], lanes[Z + i] = atom.x - origin[i, 0], atom.y - origin[i, 1], atom.z
+        lanes[VX + i], lanes[VY + i], lanes[VZ + i] = atom.vx, atom.vy, atom.vz
     for frame in range(k, last):
-        for i in range(len(moving)):
-            flight = flights[moving[i]]
-            set_tweezer(lanes, i, flight, rows, cols, frame, origin[i, 0], origin[i, 1], plane)
+        set_tweezers(lanes, origin, moving, flights, rows, cols, frame, plane)
         move(lanes, machine, frame_s, n_steps)
     for i in range(len(moving)):
         atom = state[moving[i]]
-        atom[0], atom[1], atom[2] = origin[i, 0] + lanes[X + i], origin[i, 1] + lanes[Y + i], lanes[Z + i]
-        atom[3], atom[4], atom[5] = lanes[VX + i], lanes[VY + i], lanes[VZ + i]
+        atom.x, atom.y, atom.z = origin[i, 0] + lanes[X + i], origin[i, 1] + lanes[Y + i], lanes[Z + i]
+        atom.vx, atom.vy, atom.vz = lanes[VX + i], lanes[VY + i], lanes[VZ + i]
 
 
 @helper_kernel()
-def lose(flight: Flight, fate: int, atom: Floats, plane: Floats, t_s: float) -> None:
+def lose(flight: Flight, fate: int, atom: Atom, plane: Plane, t_s: float) -> None:
     """Record when, where and by what an atom was lost."""
     flight.fate, flight.lost_s = fate, t_s
-    flight.lost_row, flight.lost_col = sites_of(atom[0], atom[1], plane)
+    flight.lost_row, flight.lost_col = sites_of(atom.x, atom.y, plane)
 
 
 @helper_kernel()
-def fall_out(flight: Flight, atom: Floats, plane: Floats, shape: tuple[int, int], t_s: float) -> None:
+def fall_out(flight: Flight, atom: Atom, plane: Plane, shape: tuple[int, int], t_s: float) -> None:
     """Lose an atom that no tweezer binds, and say by what."""
     inside = site_at(atom, plane, shape)[2]
     fate = PROGRAM if flight.until_s > flight.cut_s - 1.5 * BLOCK_S else TRANSPORT
@@ -366,30 +362,35 @@ def fall_out(flight: Flight, atom: Floats, plane: Floats, shape: tuple[int, int]
 
 @helper_kernel()
 def check_atom(
-    flight: Flight, atom: Floats, rows: Floats, cols: Floats, k: int, sites: Records, t_s: float,
-    lasted_s: float, plane: Floats, machine: Machine,
+    flight: Flight, atom: Atom, rows: Floats, cols: Floats, k: int, sites: Records, t_s: float,
+    lasted_s: float, plane: Plane, machine: Machine,
 ) -> None:  # fmt: skip
     """See what holds an atom at frame k; it is lost once it is unbound and far from everything."""
     row, col, _ = site_at(atom, plane, sites.shape)
     x, y = place_of(row, col, plane)
     depth, mobile, to_x, to_y = sites[row, col].depth, 0.0, 0.0, 0.0
-    near = square(atom[0] - x, atom[1] - y) < (GONE * machine.static_waist) ** 2
+    near = square(atom.x - x, atom.y - y) < (GONE * machine.static_waist) ** 2
     if flight.row >= 0:
-        row_tone, col_tone = rows[flight.row, k - 1], cols[flight.col, k - 1]
-        factor = (row_tone[DEPTH] + row_tone[CHANGE]) * (col_tone[DEPTH] + col_tone[CHANGE])
+        r, c, before = flight.row, flight.col, k - 1
+        factor = rows[r, before, DEPTH] + rows[r, before, CHANGE]
+        factor *= cols[c, before, DEPTH] + cols[c, before, CHANGE]
         if factor > 0.0:
             mobile = machine.mobile_depth * factor
-            at_x, at_y = place_of(row_tone[PLACE] + row_tone[WAY], col_tone[PLACE] + col_tone[WAY], plane)
-            to_x, to_y = atom[0] - at_x, atom[1] - at_y
+            at_x, at_y = place_of(
+                rows[r, before, PLACE] + rows[r, before, WAY],
+                cols[c, before, PLACE] + cols[c, before, WAY],
+                plane,
+            )
+            to_x, to_y = atom.x - at_x, atom.y - at_y
             away = square(to_x, to_y)
             near = near or away < (GONE * machine.mobile_waist) ** 2
             if mobile > depth and away < machine.mobile_waist**2:
                 record_hold(flight, math.sqrt(square(at_x - x, at_y - y)), mobile, t_s)
                 flight.glow_s += lasted_s * mobile / machine.static_depth
-    if near and abs(atom[2]) < HIGH * machine.mobile_rayleigh:
+    if near and abs(atom.z) < HIGH * machine.mobile_rayleigh:
         return
     energy = energy_in(atom, x, y, depth, machine.static_waist, machine.static_rayleigh)
-    energy += pull(to_x, to_y, atom[2], mobile, machine.mobile_waist, machine.mobile_rayleigh)[3]
+    energy += pull(to_x, to_y, atom.z, mobile, machine.mobile_waist, machine.mobile_rayleigh)[3]
     if energy >= 0.0:
         fall_out(flight, atom, plane, sites.shape, t_s)
 
@@ -411,8 +412,8 @@ def record_hold(flight: Flight, offset: float, depth: float, t_s: float) -> None
 
 @helper_kernel()
 def check_faults(
-    flight: Flight, atom: Floats, rows: Floats, row_faults: Ints, cols: Floats, col_faults: Ints, k: int,
-    start_s: float, frame_s: float, plane: Floats,
+    flight: Flight, atom: Atom, rows: Floats, row_faults: Ints, cols: Floats, col_faults: Ints, k: int,
+    start_s: float, frame_s: float, plane: Plane,
 ) -> None:  # fmt: skip
     """Note when the tweezer that holds an atom at frame k is cut off; lose an atom whose tones mix.
 
@@ -430,14 +431,14 @@ def check_faults(
 
 @helper_kernel()
 def collide(
-    state: Floats, moving: Ints, flights: Records, plane: Floats, machine: Machine, t_s: float,
+    state: Records, moving: Ints, flights: Records, plane: Plane, machine: Machine, t_s: float,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """Of two moving atoms within a waist of each other, collisions in the light leave one or none."""
     for m in range(len(moving)):
         for n in range(m):
             i, j = moving[m], moving[n]
-            x, y = state[i, 0] - state[j, 0], state[i, 1] - state[j, 1]
+            x, y = state[i].x - state[j].x, state[i].y - state[j].y
             if square(x, y) > machine.mobile_waist**2:
                 continue
             if flights[i].fate != FLYING or flights[j].fate != FLYING:
@@ -488,7 +489,7 @@ def end_of_block(k: int, ways: Floats, longest: int) -> int:
 
 @helper_kernel()
 def land(
-    flight: Flight, atom: Floats, sites: Records, plane: Floats, machine: Machine, end_s: float,
+    flight: Flight, atom: Atom, sites: Records, plane: Plane, machine: Machine, end_s: float,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """Decide the fate of an atom that is left at the end: its nearest site keeps it, if it binds it."""
@@ -511,7 +512,7 @@ def land(
 
 @helper_kernel()
 def put_down(
-    flights: Records, state: Floats, sites: Records, plane: Floats, end_s: float, lost: Ints
+    flights: Records, state: Records, sites: Records, plane: Plane, end_s: float, lost: Ints
 ) -> None:
     """Put the atoms on their sites, two on one are lost, and count the losses."""
     for i in range(len(flights)):
@@ -531,13 +532,15 @@ def put_down(
 TABLE, OFFSETS = const("float64", 2), const("int32", 1)
 TONES, SITES = const(signature(TONE), 1), f"Array({signature(SITE)}, 2, 'C')"
 FLIGHTS = f"Array({signature(FLIGHT)}, 1, 'C')"
-COURSES, FAULTS, SHOT = const("float64", 3), const("int64", 2), f"{MACHINE}, {TABLE}, npy_rng, int64[::1]"
+COURSES, FAULTS = const("float64", 3), const("int64", 2)
+PLANE = f"UniTuple(float64, {len(Plane._fields)})"
+SHOT = f"{MACHINE}, {PLANE}, npy_rng, int64[::1]"
 
 
 @helper_kernel(f"{FLIGHTS}({SITES}, {COURSES}, {FAULTS}, {COURSES}, {FAULTS}, float64, float64, {SHOT})")
 def fly(
     sites: Records, rows: Floats, row_faults: Ints, cols: Floats, col_faults: Ints, start_s: float,
-    frame_s: float, numbers: tuple[float, ...], plane: Floats, rng: np.random.Generator, lost: Ints,
+    frame_s: float, numbers: tuple[float, ...], axes: tuple[float, ...], rng: np.random.Generator, lost: Ints,
 ) -> Records:  # fmt: skip
     """Move the atoms in the light of a batch.
 
@@ -553,16 +556,17 @@ def fly(
         start_s: Time of the first frame.
         frame_s: Time from frame to frame.
         numbers: The numbers of :class:`Machine`.
-        plane: The plane of the sites.
+        axes: The numbers of :class:`labseq_virtual.records.Plane`.
         rng: Random numbers of the shot.
         lost: Number of atoms of each of ``FATES`` (6,); changed in place.
 
     Returns:
         What happened to the atoms that tweezers came near (n_atoms,).
     """
-    machine = Machine(*numbers)
+    machine, plane = Machine(*numbers), Plane(*axes)
     flights: Records = np.empty(sites.size, FLIGHT)
-    state, n = np.empty((sites.size, 6)), 0
+    state: Records = np.empty(sites.size, ATOM)
+    n = 0
     moving, lanes = np.empty(sites.size, np.int64), np.empty(LANES * N_NUMBERS, np.float32)
     origin, awake = np.empty((LANES, 2)), np.full(sites.shape, -1)
     ways, k, end_s = ways_of(rows, cols), 0, start_s
@@ -572,7 +576,11 @@ def fly(
         now_s, end_s = end_s, start_s + last * frame_s
         n = wake_atoms(rows, cols, k, last, flights, state, n, awake, sites, now_s, plane, machine, rng)
         for i in range(n):
-            if must_move(flights[i], state[i], rows, cols, k, last, awake, sites, plane, machine):
+            flight = flights[i]
+            is_asleep = flight.fate == SETTLED and awake[flight.to_row, flight.to_col] < last
+            if flight.fate < FLYING or is_asleep:
+                continue
+            if must_move(flight, state[i], rows, cols, k, last, sites, plane, machine):
                 moving[n_moving] = i
                 n_moving += 1
         for m in range(0, n_moving, LANES):
@@ -598,12 +606,12 @@ def fly(
 @kernel(f"{FLIGHTS}({SITES}, {TABLE}, {TABLE}, {TABLE}, {TABLE}, float64, float64, {SHOT})")
 def fly_in_light(
     sites: Records, rows: Floats, row_depth: Floats, cols: Floats, col_depth: Floats, start_s: float,
-    frame_s: float, numbers: tuple[float, ...], plane: Floats, rng: np.random.Generator, lost: Ints,
+    frame_s: float, numbers: tuple[float, ...], axes: tuple[float, ...], rng: np.random.Generator, lost: Ints,
 ) -> Records:  # fmt: skip
     """Move the atoms in the light of tones: places (sites) and depth factors (n_tracks, n_frames)."""
     row_faults, col_faults = np.full((len(rows), 2), NEVER), np.full((len(cols), 2), NEVER)
     of_rows, of_cols = course_of(rows, row_depth), course_of(cols, col_depth)
-    return fly(sites, of_rows, row_faults, of_cols, col_faults, start_s, frame_s, numbers, plane, rng, lost)
+    return fly(sites, of_rows, row_faults, of_cols, col_faults, start_s, frame_s, numbers, axes, rng, lost)
 
 
 @kernel(
@@ -613,8 +621,8 @@ def fly_in_light(
 def fly_in_program(
     sites: Records, rows: Records, row_offsets: NDArray[np.int32], cols: Records,
     col_offsets: NDArray[np.int32], durations_s: Floats, courses: NDArray[np.int8], n_segments: int,
-    step_hz: tuple[float, float], start_s: float, frame_s: float, numbers: tuple[float, ...], plane: Floats,
-    rng: np.random.Generator, lost: Ints,
+    step_hz: tuple[float, float], start_s: float, frame_s: float, numbers: tuple[float, ...],
+    axes: tuple[float, ...], rng: np.random.Generator, lost: Ints,
 ) -> None:  # fmt: skip
     """Move the atoms in the light of the first segments of a program, batch by batch.
 
@@ -631,7 +639,7 @@ def fly_in_program(
         start_s: When the program starts.
         frame_s: Time from frame to frame.
         numbers: The numbers of :class:`Machine`.
-        plane: The plane of the sites.
+        axes: The numbers of :class:`labseq_virtual.records.Plane`.
         rng: Random numbers of the shot.
         lost: Number of atoms of each of ``FATES`` (6,); changed in place.
     """
@@ -643,4 +651,4 @@ def fly_in_program(
             cols, col_offsets, durations_s, courses, first, last, frame_s, step_hz[1]
         )
         first_s = start_s + durations_s[:first].sum() - HALF * frame_s
-        fly(sites, rows_now, row_faults, cols_now, col_faults, first_s, frame_s, numbers, plane, rng, lost)
+        fly(sites, rows_now, row_faults, cols_now, col_faults, first_s, frame_s, numbers, axes, rng, lost)

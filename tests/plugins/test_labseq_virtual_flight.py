@@ -18,7 +18,7 @@ from labseq_virtual.flight import Conditions, Flights, RunningProgram
 from labseq_virtual.flight_kernels import fly_in_light
 from labseq_virtual.formulas import KELVIN
 from labseq_virtual.light_kernels import DEPTH, FRAMES_PER_TRANSIT, HALF, PLACE, find_batches, light_of_axis
-from labseq_virtual.records import FATES, SITE
+from labseq_virtual.records import FATES, SITE, plane_of
 from labseq_virtual.rf_analysis import PulseReceiver, RfPulse
 from labseq_virtual.settings import MobileLightSettings, SimulationSettings
 from labseq_virtual.static_array import StaticArray
@@ -48,9 +48,9 @@ MACHINE = Machine(STATIC, WAIST, STATIC_Z, MOBILE, WAIST, MOBILE_Z, 15e-6, 0.0, 
 COLD_K = 1e-7
 
 
-def plane() -> Floats:
+def plane() -> tuple[float, ...]:
     a1, a2 = GRID.axes
-    return np.vstack([GRID.positions_m[0, 0], a2, a1, np.linalg.inv(np.stack([a2, a1], axis=1))])
+    return plane_of(GRID.positions_m[0, 0], a2, a1)
 
 
 class Light:
@@ -240,7 +240,7 @@ def test_an_atom_that_is_moved_over_another_costs_both() -> None:
     sites, flights, _ = fly(program_of(batch(((5, 2), (5, 8)))), [(5, 2), (5, 5)])
     assert sites == set()
     assert flights["fate"].tolist() == [b"collision", b"collision"]
-    assert flights["lost_col"] == pytest.approx([5, 5], abs=0.3)
+    assert flights["lost_col"] == pytest.approx([5, 5], abs=0.4)  # a waist is 0.2 sites
     assert flights["lost_s"][0] == pytest.approx(60e-6 + 3 * 4.49e-6 / 0.13, abs=10e-6)
 
 
