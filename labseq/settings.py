@@ -89,6 +89,13 @@ class Settings(BaseModel):
         """
         return ()
 
+    def algorithm_text(self) -> str:
+        """Of a planner, for ``labseq check``: the algorithm that these settings choose, in 60 characters.
+
+        Empty (default) if the planner's name says it.
+        """
+        return ""
+
 
 class NoSettings(Settings):
     """The settings of a plugin that takes none."""

@@ -267,6 +267,7 @@ def _subject(assembly: Assembly) -> Facts:
     target, spec = assembly.target, assembly.sequence
     grid, document = assembly.hardware.grid, assembly.hardware.document
     listed = settings_text({k: v for k, v in assembly.planner.dump().items() if k != "use"})
+    algorithm = assembly.planner.settings.algorithm_text() if assembly.planner.settings else ""
     sites = f"{plural(target.n_atoms, 'atom')}, {plural(int(target.clear.sum()), 'site')} to be empty"
     simulated = ", dry run" if assembly.hardware.dry_run != "off" else ", simulated" * assembly.virtual_time
     return [
@@ -278,6 +279,7 @@ def _subject(assembly: Assembly) -> Facts:
         ),
         *([] if target.is_none else [("target", f"{target.name}, {sites}")]),
         ("planner", assembly.planner.entry.name + (f" ({listed})" if listed else "")),
+        *([("algorithm", clean(algorithm))] if algorithm else []),
         *(("calibration", _calibration(entry)) for entry in assembly.hardware.calibrations.values()),
         *(("scan", text) for text in _scanned(assembly)),
         *(("measures", _measure(one)) for one in assembly.resolved["measure"]),

@@ -153,6 +153,7 @@ COLUMNS: Final[Mapping[str, str]] = {
     "attempts": "how often a shot is tried",
     "device call": "longest time that a call of a device may take",
     "not opened": "devices that the check has not opened",
+    "algorithm": "which algorithm the settings of the planner choose, where its name does not say it",
     "measures": "what the run measures, with the model of its fit",
 }
 """Heads of columns and names of rows -> their meaning."""

@@ -1,4 +1,4 @@
-"""The parallel sort-and-compression algorithm of Tian et al., for any target on any grid, and repair."""
+"""A generalised PSCA for any target on any grid, PSCA as in the text of Tian et al., and repair."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ def labseq_register(registry: Registry) -> None:
     """Offer the planners ``psca`` and ``repair``."""
 
     def repair(settings: RepairSettings, context: Context) -> RepairPlanner:
+        """Another planner, but few defects are filled with few atom moves where that loses fewer atoms."""
         from labseq_psca.repair import RepairPlanner, construct_other
 
         return RepairPlanner(settings, context, construct_other(registry, settings.after, context))

@@ -1,4 +1,6 @@
-"""Kernels of the variant with fewest batches: row sorts that help all columns, both orientations compared.
+"""Kernels of the generalised PSCA: row sorts that help all columns, both orientations compared.
+
+Its plans have fewer batches than those of the paper's text, which is :mod:`labseq_psca.kernels_paper`.
 
 Everything is written for row sorting and then column compression; the other
 orientation is the same on the transposed grid. The vocabulary is that of

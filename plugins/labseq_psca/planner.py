@@ -47,22 +47,34 @@ class PscaSettings(Settings):
     )
     variant: Literal["fewest", "paper"] = Field(
         default="fewest",
-        description="fewest: few batches; paper: the paper's text taken literally, for comparison",
+        description="fewest: a generalised PSCA with fewer batches; paper: the text of Tian et al. taken "
+        "literally, to compare with that paper",
     )
     row_order: RowOrder = Field(
         default="half_filled",
-        description="which row is sorted first: among equally useful ones, or among all with variant paper",
+        description="which row is sorted first: of equally useful ones with variant fewest, of all with "
+        "variant paper",
     )
     repair_below: float = Field(
         default=0.1,
         ge=0,
         le=1,
-        description="fraction of defects up to which repair with few atom moves is considered too",
+        description="fraction of defects up to which repair with few atom moves is considered too; variant "
+        "paper never repairs",
     )
+
+    def algorithm_text(self) -> str:
+        """Which variant of PSCA it is."""
+        if self.variant == "paper":
+            return "PSCA as in the text of Tian et al."
+        return "generalised PSCA, with fewer batches than variant: paper"
 
 
 class PscaPlanner:
-    """Row sorting, then column compression, or the reverse if that takes fewer batches.
+    """A generalised PSCA (parallel sort-and-compression) with fewer batches than the text of Tian et al.
+
+    It sorts the rows that help most and then compresses columns, or the reverse if that takes fewer
+    batches. With ``variant: paper`` it does what the text of that paper says.
 
     Args:
         settings: The planner's settings.

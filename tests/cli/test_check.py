@@ -52,6 +52,24 @@ def test_a_check_names_the_devices_that_it_did_not_ask_and_what_stays_on(
     assert "when nothing plays" not in shown
 
 
+@pytest.mark.parametrize(
+    ("overrides", "variant", "algorithm"),
+    [
+        ([], "variant fewest", "generalised PSCA, with fewer batches than variant: paper"),
+        (["planner.variant=paper"], "variant paper", "PSCA as in the text of Tian et al."),
+        (["planner={use: grid}"], "", None),
+    ],
+)
+def test_a_check_names_the_algorithm_where_the_planner_has_several(
+    overrides: list[str], variant: str, algorithm: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    check_sequence(Path(SEQUENCE), None, overrides, "off", as_json=False)
+    lines = capsys.readouterr().out.splitlines()
+    rows = {name: text.strip() for name, _, text in (line.partition(" ") for line in lines)}
+    assert rows.get("algorithm") == algorithm
+    assert variant in rows["planner"]
+
+
 def test_timeline_table() -> None:
     assert timeline_table(TIMELINE, "#") == [
         "step                       start  at most  timed by",
