@@ -7,7 +7,8 @@ The first command draws a run of ``sequences/figure5_multicycle.yaml`` or ``figu
 runs to compare. The second takes many shots of these sequences with labseq's sequencer, keeps their sums
 instead of files, draws the figures of the documentation, and writes the tables of its page, with the
 differences from the paper in standard errors. Seeds are fixed. Both figures continue from their tables, so
-a long simulation can be stopped; after a change of the code that matters, delete the tables first.
+a long simulation can be stopped. A table names its planner, and is begun again with another one; after any
+other change that matters, delete the tables first.
 """
 
 from __future__ import annotations
@@ -53,10 +54,10 @@ PAPER_FILLING = ((7, 0.9766, 0.0004),)
 PAPER_DEFECT_FREE = ((1, 0.015, 0.003), (2, 0.169, 0.008), (10, 0.33, 0.01))
 """Cycles, defect-free probability, its error (figure 5)."""
 
-WINDOWS_MS = {2: 94, 3: 68}
-"""The windows of figure 4 that are longer than the shortest, 60 ms; see the sequence."""
-POINTS = [(dop, 200) for dop in range(2, 16)] + [(dop, WINDOWS_MS.get(dop, 60)) for dop in range(2, 16)]
-"""Degree of parallelism and window in ms of each point of figure 4."""
+PLANNER_KEYS = ("variant", "lanes")
+"""Settings of a planner that say which algorithm it is."""
+FEWEST = ("planner.variant=fewest",)
+"""Overrides for the generalised PSCA."""
 UNTUNED = (
     "profile.simulation.transport_loss_spread=0",
     "profile.simulation.imaging_loss=0.314 %",
@@ -65,15 +66,15 @@ UNTUNED = (
 GRID = ("planner={use: grid, degree_of_parallelism: 7, lanes: weaving}",)
 """Overrides for the planner `grid`."""
 SERIES_5: dict[str, tuple[str, tuple[str, ...]]] = {
-    "figure5": ("profile `paper`", ()),
-    "figure5_no_repair": ("the same, repair off", ("planner.repair_below=0",)),
-    "figure5_untuned": ("only the loss per atom fitted", UNTUNED),
-    "figure5_variant": ("`variant: paper`", ("planner.variant=paper",)),
+    "figure5": ("the sequence as it is", ()),
+    "figure5_fewest": ("the generalised PSCA", FEWEST),
+    "figure5_no_repair": ("the same, repair off", (*FEWEST, "planner.repair_below=0")),
     "figure5_grid": ("`grid`", GRID),
+    "figure5_untuned": ("only the loss per atom fitted", UNTUNED),
     "figure5_pairs": ("pairs leave one atom", ("profile.simulation.pair_survival=66.7 %",)),
 }
 """Table of each series of figure 5 -> its name and its overrides."""
-DRAWN_5 = ("figure5", "figure5_untuned")
+DRAWN_5 = ("figure5", "figure5_fewest")
 SEED_5, PART_5, PART_4 = 51, 250, 250
 
 
@@ -126,6 +127,24 @@ class NoObserver:
         del name, values
 
 
+def planner_text(settings: Mapping[str, Any]) -> str:
+    """Which algorithm a planner is: "psca variant=paper"; ``settings`` are all it has, and "use"."""
+    return " ".join([settings["use"], *(f"{key}={settings[key]}" for key in PLANNER_KEYS if key in settings)])
+
+
+def planner_of(sequence: str, overrides: Sequence[str] = ()) -> str:
+    """Which algorithm plans in a sequence."""
+    return planner_text(Session.open(SEQUENCES / sequence, overrides=overrides).assembly.planner.dump())
+
+
+def points_4() -> list[tuple[int, int]]:
+    """Degree of parallelism and window in ms of each point of the sequence of figure 4."""
+    assembly = Session.open(SEQUENCES / FIGURE_4).assembly
+    assert assembly.scanned is not None
+    points = [assembly.at(i).parameters for i in range(assembly.scanned.scan.n_points)]
+    return [(int(point[DOP]), round(1e3 * point["shot.2.rearrange.window"])) for point in points]
+
+
 def take(sequence: str, shots: Sequence[int], overrides: Sequence[str], seed: int) -> Tally:
     """Take the shots of a sequence, and keep what the figures need."""
     session = Session.open(SEQUENCES / sequence, overrides=overrides, seed=seed)
@@ -169,25 +188,32 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     write_file(path, text.getvalue().encode())
 
 
-def table_4() -> dict[tuple[int, int], Filled]:
+def rows_with(name: str, planner: str) -> list[dict[str, str]]:
+    """The rows of a table; none if another planner took its shots."""
+    return [row for row in rows_of(FIGURES / f"{name}.csv") if row["planner"] == planner]
+
+
+def table_4(rows: Iterable[Mapping[str, str]]) -> dict[tuple[int, int], Filled]:
     """Degree of parallelism and window in ms -> the shots of that point of figure 4."""
     return {
         (int(row["dop"]), int(row["window_ms"])): Filled(int(row["shots"]), *(float(row[k]) for k in SUMS))
-        for row in rows_of(FIGURES / "figure4.csv")
+        for row in rows
     }
 
 
 def simulate_4(n_shots: int) -> None:
     """Add shots to the points of figure 4 until all have so many, in parts."""
+    planner, points = planner_of(FIGURE_4), points_4()
     while True:
-        table = {key: Filled(0, 0.0, 0.0) for key in POINTS} | table_4()
-        key = min(POINTS, key=lambda key: table[key].shots)
+        before = table_4(rows_with("figure4", planner))
+        table = {key: before.get(key, Filled(0, 0.0, 0.0)) for key in points}
+        key = min(points, key=lambda key: table[key].shots)
         if table[key].shots >= n_shots:
             return
         part = range(table[key].shots, min(table[key].shots + PART_4, n_shots))
         table[key] = table[key].with_shots(take_4(*key, part))
         rows = [
-            {"dop": dop, "window_ms": window_ms, "shots": one.shots}
+            {"planner": planner, "dop": dop, "window_ms": window_ms, "shots": one.shots}
             | {name: f"{value:.9f}" for name, value in zip(SUMS, one[1:], strict=True)}
             for (dop, window_ms), one in table.items()
             if one.shots
@@ -208,13 +234,15 @@ def take_4(dop: int, window_ms: int, shots: range) -> NDArray[np.float64]:
 
 def simulate_5(n_shots: int) -> None:
     """Add shots to the series of figure 5 until all have so many, in parts."""
+    planners = {name: planner_of(FIGURE_5, overrides) for name, (_, overrides) in SERIES_5.items()}
     while True:
-        shots = {name: int(rows[0]["shots"]) if (rows := table_5(name)) else 0 for name in SERIES_5}
+        tables = {name: rows_with(name, planner) for name, planner in planners.items()}
+        shots = {name: int(rows[0]["shots"]) if rows else 0 for name, rows in tables.items()}
         name = min(shots, key=lambda name: shots[name])
         if shots[name] >= n_shots:
             return
         part = range(shots[name], min(shots[name] + PART_5, n_shots))
-        add_5(name, take(FIGURE_5, part, SERIES_5[name][1], SEED_5))
+        add_5(name, planners[name], take(FIGURE_5, part, SERIES_5[name][1], SEED_5))
 
 
 def table_5(name: str) -> list[dict[str, str]]:
@@ -222,13 +250,15 @@ def table_5(name: str) -> list[dict[str, str]]:
     return rows_of(FIGURES / f"{name}.csv")
 
 
-def add_5(name: str, tally: Tally) -> None:
-    """Add shots to the table of a series of figure 5."""
+def add_5(name: str, planner: str, tally: Tally) -> None:
+    """Add shots to the table of a series of figure 5; those of another planner are dropped."""
     defects, moves = np.array(tally.defects), np.array(tally.n_atom_moves)
-    before = table_5(name)
+    before = rows_with(name, planner)
     rows: list[dict[str, Any]] = []
     for cycle in range(defects.shape[1]):
-        old = {key: float(value) for key, value in before[cycle].items()} if before else {}
+        old = (
+            {key: float(value) for key, value in before[cycle].items() if key != "planner"} if before else {}
+        )
         counts = np.bincount(np.minimum(defects[:, cycle], 9), minlength=10)
         n_old = int(old.get("shots", 0))
         n = n_old + len(defects)
@@ -237,6 +267,7 @@ def add_5(name: str, tally: Tally) -> None:
         squares = n_old * old.get("filling_squared", 0.0) + ((1 - defects[:, cycle] / PAPER_ATOMS) ** 2).sum()
         rows.append(
             {
+                "planner": planner,
                 "cycles": cycle + 1,
                 "shots": n,
                 **{f"defects_{k}": int(counts[k] + old.get(f"defects_{k}", 0)) for k in range(10)},
@@ -262,6 +293,7 @@ def lines_5() -> list[str]:
     """The table of figure 5 with its differences from the paper."""
     header = (
         "series",
+        "planner",
         "shots",
         "after one cycle",
         "after two",
@@ -271,14 +303,14 @@ def lines_5() -> list[str]:
     )
     cells = [percent(p, e) for _, p, e in (*PAPER_DEFECT_FREE, *PAPER_FILLING)]
     lines = [
-        "| " + " | ".join(row) + " |" for row in (header, ["---"] * 7, ["Tian et al.", "", *cells, "2.7"])
+        "| " + " | ".join(row) + " |" for row in (header, ["---"] * 8, ["Tian et al.", "", "", *cells, "2.7"])
     ]
     for name, (label, _) in SERIES_5.items():
         rows = table_5(name)
         if not rows:
             continue
         n = int(rows[0]["shots"])
-        cells = [label, str(n)]
+        cells = [label, f"`{rows[0]['planner']}`", str(n)]
         for cycle, paper, paper_error in PAPER_DEFECT_FREE:
             p = int(rows[cycle - 1]["defects_0"]) / n
             error = math.sqrt(p * (1 - p) / n)
@@ -294,21 +326,36 @@ def lines_5() -> list[str]:
 
 def lines_4() -> list[str]:
     """The table of figure 4."""
-    table = table_4()
-    header = ["DOP", *map(str, range(2, 16))]
-    lines = ["| " + " | ".join(row) + " |" for row in (header, ["---"] * 15)]
-    for label, keys in (("window 200 ms", POINTS[:14]), ("own window, 60 to 94 ms", POINTS[14:])):
-        cells = [f"{100 * table[key].filling:.2f}" if key in table else "" for key in keys]
+    rows = rows_of(FIGURES / "figure4.csv")
+    table = table_4(rows)
+    lines = ["| " + " | ".join(row) + " |" for row in (["DOP", *map(str, range(2, 16))], ["---"] * 15)]
+    for label, points in series_4(table).items():
+        cells = [f"{100 * one.filling:.2f}" for one in points.values()]
         lines.append("| " + " | ".join([label, *cells]) + " |")
     shots, errors = [one.shots for one in table.values()], [100 * one.error for one in table.values()]
     least, most = (f"{end(errors):.3f}" for end in (min, max))
-    lines += ["", f"{min(shots)} shots or more for each point; standard errors {least} to {most} %."]
-    if (7, 60) in table:
-        one = table[7, 60]
-        away = difference(one.filling, one.error, *PAPER_FILLING[0][1:])
-        value = percent(one.filling, one.error)
-        lines += [f"At DOP 7: {value}, {away} standard errors from the paper's 97.66(4) %."]
-    return lines
+    extent = f"{min(shots)} shots or more for each point, planned by `{rows[0]['planner']}`"
+    _, of_7 = (points[7] for points in series_4(table).values())
+    away = difference(of_7.filling, of_7.error, *PAPER_FILLING[0][1:])
+    value = percent(of_7.filling, of_7.error)
+    return [
+        *lines,
+        "",
+        f"{extent}; standard errors {least} to {most} %.",
+        f"At DOP 7 in its own window: {value}, {away} standard errors from the paper's 97.66(4) %.",
+    ]
+
+
+def series_4(table: Mapping[tuple[int, int], Filled]) -> dict[str, dict[int, Filled]]:
+    """The two series of figure 4: the windows -> degree of parallelism -> shots; the common window first."""
+    longest = max(window_ms for _, window_ms in table)
+    own = [window_ms for _, window_ms in table if window_ms < longest]
+    return {
+        f"window {longest} ms": {dop: one for (dop, ms), one in table.items() if ms == longest},
+        f"own window, {min(own)} to {max(own)} ms": {
+            dop: one for (dop, ms), one in table.items() if ms < longest
+        },
+    }
 
 
 def write_page(page: Path = PAGE) -> None:
@@ -535,7 +582,9 @@ def paper_points(points: Sequence[tuple[int, float, float]], n_atoms: int = PAPE
 def note_of(run: Run) -> str:
     """Name, target and seed of a run."""
     kind = "simulated" if run.simulated else "measured"
-    return f"{run.path.name}: {run.target.n_atoms} atoms, {len(run.shots)} shots, seed {run.seed}, {kind}"
+    planner = planner_text(run.record["resolved"]["planner"])
+    shots = f"{len(run.shots)} shots, seed {run.seed}, {kind}"
+    return f"{run.path.name}: {run.target.n_atoms} atoms, {planner}, {shots}"
 
 
 def labels_of(runs: Sequence[Run]) -> list[str]:
@@ -665,17 +714,20 @@ def window_text(rows: Sequence[Filling]) -> str:
 
 def draw_4(path: Path) -> None:
     """Draw figure 4 from its table."""
-    table = table_4()
-    series: list[Points] = []
-    for label, keys in (("window 200 ms", POINTS[:14]), ("windows 60 to 94 ms", POINTS[14:])):
-        found = [(key[0], table[key].filling, table[key].error) for key in keys if key in table]
-        series.append(Points.of(label, [(dop, y, y - error, y + error) for dop, y, error in found]))
-    left = [
-        (dop, p, p, p) for dop, window in POINTS[14:] for p in (survival(window / 1e3, PAPER_LIFETIME_S),)
-    ]
-    windows = Points.of("survival of the windows 60 to 94 ms (lifetime 33 s)", left)
-    note = f"profile paper, {min(one.shots for one in table.values())} shots for each point"
-    draw_figure_4(path, note, series[:1], series[1:], windows, paper_points(PAPER_FILLING))
+    rows = rows_of(FIGURES / "figure4.csv")
+    table = table_4(rows)
+    fixed, own = (
+        Points.of(
+            label, [(dop, f.filling, f.filling - f.error, f.filling + f.error) for dop, f in points.items()]
+        )
+        for label, points in series_4(table).items()
+    )
+    windows_s = {dop: ms / 1e3 for dop, ms in sorted(table, reverse=True)}  # the shortest of each comes last
+    left = [(dop, *3 * [survival(s, PAPER_LIFETIME_S)]) for dop, s in sorted(windows_s.items())]
+    windows = Points.of(f"survival of the {own.label} (lifetime {PAPER_LIFETIME_S:g} s)", left)
+    shots = min(one.shots for one in table.values())
+    note = f"profile paper, {rows[0]['planner']}, {shots} shots for each point"
+    draw_figure_4(path, note, [fixed], [own], windows, paper_points(PAPER_FILLING))
 
 
 def draw_5(path: Path) -> None:
@@ -683,12 +735,12 @@ def draw_5(path: Path) -> None:
     series: list[Points] = []
     defects: list[NDArray[np.int64]] = []
     for name in DRAWN_5:
-        rows, label = table_5(name), SERIES_5[name][0].replace("`", "")
+        rows = table_5(name)
         rates = [Rate(int(row["defects_0"]), int(row["shots"])) for row in rows]
         points = [(n, rate.value, *rate.interval) for n, rate in enumerate(rates, start=1)]
-        series.append(Points.of(f"{label}, {rows[0]['shots']} shots", points))
+        series.append(Points.of(f"{rows[0]['planner']}, {rows[0]['shots']} shots", points))
         defects.append(np.array([int(rows[-1][f"defects_{n}"]) for n in range(10)]))
-    note = "15 x 15 atoms, degree of parallelism 7"
+    note = "profile paper, 15 x 15 atoms, degree of parallelism 7"
     draw_figure_5(path, note, series, defects, paper_points(PAPER_DEFECT_FREE))
 
 

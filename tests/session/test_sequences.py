@@ -44,7 +44,13 @@ def test_the_atoms_are_enough_and_some_are_left_for_repairs(name: str) -> None:
     assert (~target.fill & ~target.clear).sum() > 100
 
 
-@pytest.mark.parametrize("dop", [2, 7])
+@pytest.mark.parametrize("name", ["figure4_dop_scan", "figure5_multicycle"])
+def test_figures_of_the_paper_are_planned_as_its_text_says(name: str) -> None:
+    planner = labseq.Session.open(ROOT / "sequences" / f"{name}.yaml").assembly.planner.dump()
+    assert (planner["use"], planner["variant"], planner["row_order"]) == ("psca", "paper", "half_filled")
+
+
+@pytest.mark.parametrize("dop", [2, 4, 7])
 def test_nearly_all_plans_fit_the_own_windows_of_figure_4(dop: int) -> None:
     scan = labseq.Session.open(ROOT / "sequences" / "figure4_dop_scan.yaml").assembly
     assert scan.scanned is not None
@@ -55,7 +61,7 @@ def test_nearly_all_plans_fit_the_own_windows_of_figure_4(dop: int) -> None:
     session = labseq.Session.open(
         ROOT / "sequences" / "compact_225.yaml",
         profile=str(ROOT / "hardware_profiles" / "paper.yaml"),
-        overrides=[f"planner.degree_of_parallelism={dop}"],
+        overrides=[f"planner.degree_of_parallelism={dop}", "planner.variant=paper"],
     )
     rehearsal = check(session).rehearsal
     assert rehearsal is not None
