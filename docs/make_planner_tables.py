@@ -1,12 +1,13 @@
 """Measure the planners again: the tables and pictures of their page, or one figure of the paper.
 
-    python docs/make_planner_tables.py --loadings 10000
-    python docs/make_planner_tables.py --figure 2b --loadings 1000 [--output figure-2b.png]
+    python docs/make_planner_tables.py --loadings 10000 [--part variants]
+    python docs/make_planner_tables.py --figure 2b --loadings 1000 [--loading 63.7%] [--output figure-2b.png]
 
-The first command replaces the parts of the page between ``<!-- measured: NAME -->`` and ``<!-- end -->``.
-Times are those of this machine: let nothing else run. The second draws one of the paper's figures 2b, 2c,
-3a and 3b. What the paper leaves open is chosen here: the size of the grid next to that of the target, and
-in figure 3 the degree of parallelism; see ``docs/explanation/planners.md``.
+The first command replaces the parts of the page between ``<!-- measured: NAME -->`` and ``<!-- end -->``,
+or one of them. Times are those of this machine: let nothing else run. The second prints and draws one of
+the paper's figures 2b, 2c, 3a and 3b, at the paper's loading or another one. What the paper leaves open is
+chosen here: the size of the grid next to that of the target, and in figure 3 the degree of parallelism; see
+``docs/explanation/planners.md``.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal
@@ -32,6 +34,7 @@ from labseq.bench.comparison import (
     Comparison,
     Condition,
     PlannerEntry,
+    parse_loading,
     read_comparison,
 )
 from labseq.bench.planners import Resources, compare
@@ -67,27 +70,60 @@ def planners(n_loadings: int) -> list[str]:
         "to the bound",
     )
     command = f"labseq bench planners --planners {PLANNERS} --dop 15 --loadings {n_loadings} --workers 1"
-    return [*shown(command), *markdown(header, map(planner_cells, report.rows))]
+    return [*shown(command), *planner_table(header, report)]
 
 
-def planner_cells(row: Row) -> list[str]:
-    batches, motion_s = row["n_batches"], row["motion_s"]
-    scans = f" ({row['n_scans']} scans)" if row.scans else ""
-    scan_s = f" ({row['scan_s'].scaled(1e3)} ms)" if row.scans else ""
-    return [
-        f"`{row.planner_entry.label}`",
-        f"{batches}{scans}",
-        str(row["n_atoms_moved"]),
-        f"{row['distance_m'].scaled(1e3)} mm",
-        f"{motion_s.scaled(1e3)} ms{scan_s}",
-        format_quantity(row["planning_s"]["median"], "time"),
-        f"{100 * row['target_met'].value:.4g} %",
-        str(row["ratio_to_bound"]),
-    ]
+def variants(n_loadings: int) -> list[str]:
+    """The generalised PSCA beside the paper's, with what each loses."""
+    choice, dops = "psca,psca:variant=paper", "2,7,15"
+    report = compare(read_comparison(planners=choice, dop=dops, loadings=n_loadings), Resources(1))
+    header = (
+        "planner",
+        "DOP",
+        "batches",
+        "atoms moved",
+        "distance",
+        "motion",
+        "atoms lost",
+        "defect-free",
+        "to the bound",
+    )
+    command = f"labseq bench planners --planners {choice} --dop {dops} --loadings {n_loadings} --workers 1"
+    return [*shown(command), *planner_table(header, report)]
+
+
+def planner_table(header: Sequence[str], report: Report) -> list[str]:
+    """A row of the report on each line, with these of its values."""
+    return markdown(header, ([CELLS[name](row) for name in header] for row in report.rows))
+
+
+def _batches(row: Row) -> str:
+    return f"{row['n_batches']}" + (f" ({row['n_scans']} scans)" if row.scans else "")
+
+
+def _motion(row: Row) -> str:
+    scans = f" ({row['scan_s'].scaled(1e3)} ms)" if row.scans else ""
+    return f"{row['motion_s'].scaled(1e3)} ms{scans}"
+
+
+CELLS: Final[Mapping[str, Callable[[Row], str]]] = {
+    "planner": lambda row: f"`{row.planner_entry.label}`",
+    "DOP": lambda row: str(row["degree_of_parallelism"]),
+    "batches": _batches,
+    "atoms moved": lambda row: str(row["n_atoms_moved"]),
+    "distance": lambda row: f"{row['distance_m'].scaled(1e3)} mm",
+    "motion": _motion,
+    "planning": lambda row: format_quantity(row["planning_s"]["median"], "time"),
+    "target met": lambda row: f"{100 * row['target_met'].value:.4g} %",
+    "atoms lost": lambda row: str(row["n_lost"]),
+    "defect-free": lambda row: f"{row['p_defect_free'].scaled(100)} %",
+    "to the bound": lambda row: str(row["ratio_to_bound"]),
+}
+"""Head of a column -> its cell in a row."""
 
 
 def sizes(n_loadings: int) -> list[str]:
-    """PSCA in growing arrays."""
+    """The generalised PSCA in growing arrays."""
     rows: list[list[str]] = []
     for grid, side in SIZES:
         target = f"{{pattern: compact, rows: {side}, cols: {side}}}"
@@ -158,7 +194,7 @@ class Figure:
 
     Attributes:
         name: Its name in the paper.
-        title: What is compared, and how.
+        title: What is compared, and how, except for the loading.
         x: What differs between the conditions.
         y: What is drawn over it.
         planner_entries: A curve each.
@@ -167,6 +203,7 @@ class Figure:
         paper: The paper's result, as text.
         paper_points: The paper's points: (x, y) each.
         histograms_at: Degrees of parallelism for which the first planner's batches are drawn as histograms.
+        options: Options of this script that give it its loading, if it is not the paper's.
     """
 
     name: str
@@ -179,10 +216,34 @@ class Figure:
     paper: str
     paper_points: tuple[tuple[float, float], ...] = ()
     histograms_at: tuple[int, ...] = ()
+    options: str = ""
+
+    @property
+    def loading(self) -> float:
+        """Probability that a site is loaded."""
+        return self.conditions[0].loading
+
+    @property
+    def part(self) -> str:
+        """Name of its part of the page."""
+        return f"figure {self.name}" + (f" at {percents(self.loading)}" if self.options else "")
+
+    def at(self, loading: float) -> Figure:
+        """The same at another loading."""
+        conditions = tuple(replace(condition, loading=loading) for condition in self.conditions)
+        return replace(self, conditions=conditions, options=f' --loading "{percents(loading)}"')
 
 
-PSCA: Final = PlannerEntry("psca")
-PSCA_OF_THE_PAPER: Final = PlannerEntry("psca", (("variant", "paper"),))
+def percents(loading: float) -> str:
+    """A loading as text: "63.7 %"."""
+    return f"{100 * loading:g} %"
+
+
+GENERALISED_PSCA: Final = PlannerEntry("psca")
+PAPERS_PSCA: Final = PlannerEntry("psca", (("variant", "paper"),))
+LABELS: Final = {GENERALISED_PSCA: "psca, generalised"}
+"""Planners that are not called by their names and settings alone."""
+LSAP_SQUARED: Final = PlannerEntry("lsap_squared")
 ROWS_X_COLUMNS: Final = PlannerEntry("grid")
 
 EBADI: Final = (("speed", "75 um/ms"), ("pick_up", "15 us"), ("drop_off", "15 us"))
@@ -211,7 +272,7 @@ def _interleaved(side: int) -> Condition:
 
 _COMPACT: Final = tuple(_compact(side) for side in (6, 9, 12, 15))
 _INTERLEAVED: Final = tuple(_interleaved(side) for side in (5, 7, 10, 13, 15, 18, 20))
-_MTA1: Final = (PSCA, PSCA_OF_THE_PAPER, PlannerEntry("mta1"))
+_MTA1: Final = (PAPERS_PSCA, GENERALISED_PSCA, PlannerEntry("mta1"))
 
 FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
     {
@@ -219,20 +280,20 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
         for figure in (
             Figure(
                 name="2b",
-                title="compact targets, 75 % loading, degree of parallelism 15",
+                title="compact targets, degree of parallelism 15",
                 x="n_target_atoms",
                 y="n_batches",
-                planner_entries=(PSCA, PSCA_OF_THE_PAPER, ROWS_X_COLUMNS, PlannerEntry("lsap_squared")),
+                planner_entries=(PAPERS_PSCA, GENERALISED_PSCA, ROWS_X_COLUMNS, LSAP_SQUARED),
                 conditions=_COMPACT,
                 fitted=True,
                 paper="PSCA 0.48(2), modified LSAP 1.16(1)",
             ),
             Figure(
                 name="2c",
-                title="15 x 15 out of 20 x 20, 75 % loading",
+                title="15 x 15 out of 20 x 20",
                 x="degree_of_parallelism",
                 y="n_batches",
-                planner_entries=(PSCA, PSCA_OF_THE_PAPER, ROWS_X_COLUMNS),
+                planner_entries=(PAPERS_PSCA, GENERALISED_PSCA, ROWS_X_COLUMNS),
                 conditions=tuple(
                     Condition((20, 20), "{pattern: compact, rows: 15, cols: 15}", 0.75, dop)
                     for dop in range(2, 16)
@@ -244,7 +305,7 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
             ),
             Figure(
                 name="3a",
-                title="interleaved targets, 55 % loading, any degree of parallelism",
+                title="interleaved targets, any degree of parallelism",
                 x="n_target_atoms",
                 y="n_batches",
                 planner_entries=_MTA1,
@@ -254,7 +315,7 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
             ),
             Figure(
                 name="3b",
-                title="interleaved targets, 55 % loading, any degree of parallelism",
+                title="interleaved targets, any degree of parallelism",
                 x="n_target_atoms",
                 y="motion_s",
                 planner_entries=_MTA1,
@@ -303,7 +364,8 @@ def points_of(report: Report, figure: Figure) -> list[Points]:
     found: list[Points] = []
     for planner_entry in report.comparison.planner_entries:
         rows = report.rows_of(planner_entry)
-        label = f"{planner_entry.label} (scans)" if any(row.scans for row in rows) else planner_entry.label
+        label = LABELS.get(planner_entry, planner_entry.label)
+        label += " (scans)" if any(row.scans for row in rows) else ""
         found.append(_points(label, rows, figure, [_y(row, figure.y) for row in rows]))
     if figure.y == "n_batches":
         rows = report.rows_of(report.comparison.planner_entries[0])
@@ -340,11 +402,14 @@ def draw_figure(path: Path, report: Report, figure: Figure) -> None:
     for i, row in enumerate(rows):
         draw_histogram(panels[0, 0], row.counts, f"C{i}", f"DOP {row['degree_of_parallelism']}")
     if rows:
-        panels[0, 0].set(xlabel=f"batches of {first.label}", ylabel="share of the loadings")
+        panels[0, 0].set(
+            xlabel=f"batches of {LABELS.get(first, first.label)}", ylabel="share of the loadings"
+        )
         panels[0, 0].legend(frameon=False, fontsize=8)
     draw_curves(panels[0, -1], points_of(report, figure), figure)
     note = f"{report.extent_text}\nthe paper: {figure.paper}"
-    drawing.suptitle(f"figure {figure.name}: {figure.title}\n{note}", fontsize=9)
+    title = f"{figure.title}, {percents(figure.loading)} loading"
+    drawing.suptitle(f"figure {figure.name}: {title}\n{note}", fontsize=9)
     drawing.savefig(path, dpi=150, metadata={"Software": None})
     plt.close(drawing)
 
@@ -381,28 +446,16 @@ def draw_curves(axes: Axes, curves: Sequence[Points], figure: Figure) -> None:
     axes.legend(frameon=False, fontsize=8)
 
 
-def measure_figure(
-    figure: Figure, n_loadings: int, motion: Sequence[tuple[str, str]] = (), n_workers: int | None = None
+@cache
+def measured(
+    planner_entries: tuple[PlannerEntry, ...], conditions: tuple[Condition, ...], n_loadings: int
 ) -> Report:
-    """Let the planners of a figure plan its loadings.
-
-    Args:
-        figure: The figure.
-        n_loadings: Number of loadings of each point.
-        motion: Settings of the mobile tweezers to change, such as ("speed", "130 um/ms").
-        n_workers: Number of processes; None for one per core.
-    """
-    conditions = tuple(replace(one, motion=(*one.motion, *motion)) for one in figure.conditions)
-    called = f"figure {figure.name}"
-    comparison = Comparison(figure.planner_entries, conditions, n_loadings, 1, (), called)
-    return compare(comparison, Resources(n_workers))
+    """Let planners plan loadings; figures with the same ones share the report."""
+    return compare(Comparison(planner_entries, conditions, n_loadings, 1, (), "the figure"))
 
 
-def figure_lines(figure: Figure, report: Report, n_loadings: int) -> list[str]:
-    """A figure of the paper: a column per curve, a row per point."""
-    PICTURES.mkdir(parents=True, exist_ok=True)
-    picture = PICTURES / f"figure-{figure.name}.png"
-    draw_figure(picture, report, figure)
+def table_of(figure: Figure, report: Report) -> list[str]:
+    """The table of a figure: a column per curve, a row per point."""
     curves = points_of(report, figure)
     factor = 1e3 if figure.y == "motion_s" else 1.0
     name = "N" if figure.x == "n_target_atoms" else "DOP"
@@ -412,17 +465,84 @@ def figure_lines(figure: Figure, report: Report, n_loadings: int) -> list[str]:
     ]
     if figure.fitted:
         rows.append(["exponent", *(str(c.law.exponent) if c.law else "-" for c in curves)])
-    command = f"python docs/make_planner_tables.py --figure {figure.name} --loadings {n_loadings}"
-    table = markdown([name, *(c.label for c in curves)], rows)
     what = "milliseconds" if factor > 1.0 else "batches, or scans where the source counts those"
-    return [
-        *shown(command, not_run=True),
-        *table,
-        "",
-        f"In {what}.",
-        "",
-        f"![Figure {figure.name}](../_static/planners/{picture.name})",
+    return [*markdown([name, *(c.label for c in curves)], rows), "", f"In {what}."]
+
+
+def figure_lines(figure: Figure, n_loadings: int) -> list[str]:
+    """A figure of the paper on the page: its command, its table, and at the paper's loading its picture."""
+    report = measured(figure.planner_entries, figure.conditions, n_loadings)
+    options = f"--figure {figure.name}{figure.options} --loadings {n_loadings}"
+    lines = [
+        *shown(f"python docs/make_planner_tables.py {options}", not_run=True),
+        *table_of(figure, report),
     ]
+    if figure.options:
+        return lines
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    picture = PICTURES / f"figure-{figure.name}.png"
+    draw_figure(picture, report, figure)
+    return [*lines, "", f"![Figure {figure.name}](../_static/planners/{picture.name})"]
+
+
+HYPOTHESIS: Final = 0.637
+"""A loading at which the paper's text gives nearly as many batches as the paper states."""
+STATED: Final[Mapping[str, Estimate]] = {
+    "exponent of PSCA, figure 2(b)": Estimate(0.48, 0.02),
+    "exponent of modified LSAP, figure 2(b)": Estimate(1.16, 0.01),
+    "batches at DOP 2, figure 2(c)": Estimate(160.0, 0.2),
+    "batches at DOP 15, figure 2(c)": Estimate(29.61, 0.03),
+}
+"""All numbers that the paper states of these figures."""
+SPREADS: Final[Mapping[str, str]] = {
+    "s.d. of the batches at DOP 2": "15 to 25",
+    "s.d. of the batches at DOP 15": "2.5 to 3.5",
+}
+"""What the errors of the means, 0.2 and 0.03, imply if figure 2(c) has 10,000 loadings as 2(b) has."""
+
+
+def statements(n_loadings: int) -> list[str]:
+    """What the paper states of figures 2(b) and 2(c), and what its text gives at two loadings."""
+    loadings = FIGURES["2b"].loading, HYPOTHESIS
+    columns = [results_at(loading, n_loadings) for loading in loadings]
+    rows = [
+        [
+            name,
+            str(paper),
+            *(cell for c in columns for cell in (str(c[name]), f"{away(c[name], paper):+.1f}")),
+        ]
+        for name, paper in STATED.items()
+    ]
+    sums = (sum(away(c[name], paper) ** 2 for name, paper in STATED.items()) for c in columns)
+    rows.append(["sum of squares", "", *(x for one in sums for x in ("", f"{one:.0f}"))])
+    for name, paper in (*SPREADS.items(), (SHORT, "")):
+        rows.append([name, paper, *(x for c in columns for x in (str(c[name]), ""))])
+    header = ["", "the paper", *(x for p in loadings for x in (f"its text at {percents(p)}", "away"))]
+    command = f"python docs/make_planner_tables.py --part statements --loadings {n_loadings}"
+    return [*shown(command, not_run=True), *markdown(header, rows)]
+
+
+SHORT: Final = "loadings with too few atoms, N = 36 / 81 / 144 / 225"
+
+
+def away(value: Estimate, paper: Estimate) -> float:
+    """How far a value is from the paper's, in standard errors of both."""
+    return (value.value - paper.value) / math.hypot(value.error, paper.error)
+
+
+def results_at(loading: float, n_loadings: int) -> dict[str, Any]:
+    """What the paper's text gives at a loading: name in :data:`STATED` or :data:`SPREADS` -> estimate."""
+    sizes = replace(FIGURES["2b"].at(loading), planner_entries=(PAPERS_PSCA, LSAP_SQUARED))
+    of_sizes = measured(sizes.planner_entries, sizes.conditions, n_loadings)
+    exponents = [points.law and points.law.exponent for points in points_of(of_sizes, sizes)[:2]]
+    dops = FIGURES["2c"].at(loading).conditions
+    rows = measured((PAPERS_PSCA,), (dops[0], dops[-1]), n_loadings).rows
+    batches = [row["n_batches"] for row in rows]
+    spreads = [one.scaled(math.sqrt(n_loadings)) for one in batches]
+    spreads = [Estimate(one.error, one.error / math.sqrt(2 * n_loadings)) for one in spreads]
+    values = [*exponents, *batches, *spreads]
+    short = " / ".join(str(row["n_short"]) for row in of_sizes.rows_of(PAPERS_PSCA))
+    return {**dict(zip((*STATED, *SPREADS), values, strict=True)), SHORT: short}
 
 
 def shown(command: str, *, not_run: bool = False) -> list[str]:
@@ -430,19 +550,17 @@ def shown(command: str, *, not_run: bool = False) -> list[str]:
     return [*note, "```console", command, "```", ""]
 
 
-def figures(names: Sequence[str], n_loadings: int) -> dict[str, list[str]]:
-    """The figures; those of the same loadings are measured together."""
-    reports: dict[object, Report] = {}
-    for figure in (FIGURES[name] for name in names):
-        key = (figure.planner_entries, figure.conditions)
-        if key not in reports:
-            reports[key] = measure_figure(figure, n_loadings)
-    return {
-        f"figure {name}": figure_lines(
-            FIGURES[name], reports[FIGURES[name].planner_entries, FIGURES[name].conditions], n_loadings
-        )
-        for name in names
+FIGURE_PARTS: Final = (*FIGURES.values(), *(FIGURES[name].at(HYPOTHESIS) for name in ("2b", "2c")))
+PARTS: Final[Mapping[str, Callable[[int], list[str]]]] = MappingProxyType(
+    {
+        "planners": planners,
+        "variants": variants,
+        "sizes": sizes,
+        **{figure.part: partial(figure_lines, figure) for figure in FIGURE_PARTS},
+        "statements": statements,
     }
+)
+"""Name of a measured part of the page -> makes its lines for a number of loadings."""
 
 
 def replaced(page: str, name: str, lines: Sequence[str]) -> str:
@@ -460,28 +578,29 @@ def replaced(page: str, name: str, lines: Sequence[str]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Measure the planners, and draw the paper's figures.")
     parser.add_argument("--loadings", type=int, default=10_000)
-    parser.add_argument("--figure", choices=[*FIGURES], help="draw this figure of the paper only")
+    parser.add_argument("--part", choices=[*PARTS], help="measure only this part of the page")
+    parser.add_argument("--figure", choices=[*FIGURES], help="print and draw this figure of the paper only")
+    parser.add_argument("--loading", type=parse_loading, help="loading of --figure, if not the paper's")
     parser.add_argument("--set", action="append", default=[], help="such as speed='130 um/ms'")
     parser.add_argument("--output", type=Path, help="picture of --figure; by default figure-2b.png, ...")
     given = parser.parse_args(arguments)
     if given.figure is not None:
         figure = FIGURES[given.figure]
+        figure = figure if given.loading is None else figure.at(given.loading)
         motion = [(key, value) for key, _, value in (one.partition("=") for one in given.set)]
-        report = measure_figure(figure, given.loadings, motion)
+        conditions = tuple(replace(one, motion=(*one.motion, *motion)) for one in figure.conditions)
+        report = measured(figure.planner_entries, conditions, given.loadings)
         picture = given.output or Path(f"figure-{figure.name}.png")
         draw_figure(picture, report, figure)
-        fits = [f"{one.label}: N^{one.law.exponent}" for one in points_of(report, figure) if one.law]
-        sys.stdout.write("\n".join([*fits, f"the paper: {figure.paper}", f"written: {picture}", ""]))
+        lines = [*table_of(figure, report), f"the paper: {figure.paper}", f"written: {picture}", ""]
+        sys.stdout.write("\n".join(lines))
         return
-    parts: dict[str, Callable[[int], list[str]]] = {"planners": planners, "sizes": sizes}
-    measured = {name: measure(given.loadings) for name, measure in parts.items()} | figures(
-        [*FIGURES], given.loadings
-    )
-    page = PAGE.read_text(encoding="utf-8")
-    for name, lines in measured.items():
-        page = replaced(page, name, lines)
-    PAGE.write_text(page, encoding="utf-8")
-    sys.stdout.write(f"written: {PAGE.relative_to(DOCS)}, {', '.join(measured)}\n")
+    names = [*PARTS] if given.part is None else [given.part]
+    for name in names:
+        lines = PARTS[name](given.loadings)
+        page = PAGE.read_text(encoding="utf-8")  # after the measurement, which takes long
+        PAGE.write_text(replaced(page, name, lines), encoding="utf-8")
+    sys.stdout.write(f"written: {PAGE.relative_to(DOCS)}, {', '.join(names)}\n")
 
 
 if __name__ == "__main__":

@@ -81,7 +81,7 @@ def curves(report: Report, drawn: Any) -> dict[str, Any]:
 
 def test_the_bound_is_drawn_with_the_planners(report: Report) -> None:
     points = points_of(report, figure())
-    assert [one.label for one in points] == ["psca", "bound"]
+    assert [one.label for one in points] == ["psca, generalised", "bound"]
     assert points[0].x.tolist() == points[1].x.tolist() == [9.0, 36.0, 81.0]
     assert (points[0].y >= points[1].y).all()
     assert [*curves(report, figure())] == [f"{one.label}: $N^{{{one.law.exponent}}}$" for one in points]
@@ -92,7 +92,7 @@ def test_a_figure_over_the_degree_of_parallelism_has_no_law_but_histograms(tmp_p
     over_dop = replace(FIGURES["2c"], planner_entries=(PlannerEntry("psca"),), conditions=conditions)
     report = compared(conditions)
     assert [one.law for one in points_of(report, over_dop)] == [None, None]
-    assert {*curves(report, over_dop)} == {"psca", "bound", "the paper"}
+    assert {*curves(report, over_dop)} == {"psca, generalised", "bound", "the paper"}
     for name, drawn in (("two", over_dop), ("one", replace(over_dop, histograms_at=()))):
         SCRIPT.draw_figure(tmp_path / f"{name}.png", report, drawn)
     with Image.open(tmp_path / "one.png") as one, Image.open(tmp_path / "two.png") as two:
@@ -104,7 +104,7 @@ def test_a_planner_that_scans_is_drawn_by_its_scans(tmp_path: Path, monkeypatch:
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
     report = compared(CONDITIONS, PlannerEntry("scans"), PlannerEntry("psca"))
     batches, times = points_of(report, figure()), points_of(report, figure(y="motion_s"))
-    assert [one.label for one in batches] == ["scans (scans)", "psca", "bound"]
+    assert [one.label for one in batches] == ["scans (scans)", "psca, generalised", "bound"]
     assert batches[0].y.tolist() == [7.0] * 3
     assert times[0].y.tolist() == [0.5] * 3
     assert (times[1].y < 0.1).all()
