@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -13,6 +14,7 @@ from labseq.config.document import StoredText
 from labseq.config.profile import GridSettings
 from labseq.config.validation import validate_values
 from labseq.data.reader import Run
+from labseq.data.shot import Shot
 from labseq.errors import RecordingError
 from labseq.files import read_file
 from labseq.model import CalibrationEntry, MotionSpec, RandomStream, SiteGrid
@@ -137,6 +139,43 @@ def recorded_machine(machine: Mapping[str, Any], called: str) -> Machine:
         validate_values(GridSettings, machine.get("grid", {}), called).model(),
         validate_values(MotionSpec, motion, called),
     )
+
+
+def profile_of_shot(resolved: Mapping[str, Any], parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """The profile that a shot was taken with: that of its run with the shot's own point of a scan.
+
+    Args:
+        resolved: Every setting of the run, SI; for a scan, at its first point.
+        parameters: Settings of the shot: address -> value, SI.
+
+    Example:
+        >>> resolved = {"profile": {"mobile_tweezers": {"speed": 0.08}}}
+        >>> profile_of_shot(resolved, {"shots": 3, "profile.mobile_tweezers.speed": 0.13})
+        {'mobile_tweezers': {'speed': 0.13}}
+    """
+    settings = deepcopy(dict(resolved))
+    for address, value in parameters.items():
+        *parts, name = address.split(".")
+        part: Any = settings
+        for key in parts:
+            part = part.get(key) if isinstance(part, dict) else None
+        if parts[:1] == ["profile"] and isinstance(part, dict) and name in part:
+            part[name] = value
+    return settings["profile"]
+
+
+def machine_of_shot(shot: Shot) -> Machine:
+    """Grid and motion of a recorded shot, with calibrated tones.
+
+    Raises:
+        ConfigError: The recorded settings are invalid.
+        RecordingError: The shot's file is damaged, or has no settings.
+    """
+    resolved: Any = shot.provenance["resolved"]
+    if not (isinstance(resolved, dict) and isinstance(cast("Any", resolved).get("profile"), dict)):
+        raise RecordingError(shot.file, "does not say what the shot was taken with")
+    profile = profile_of_shot(cast("dict[str, Any]", resolved), shot.parameters)
+    return recorded_machine(profile, "the profile in the shot's file")
 
 
 def machine_of(run: Run) -> Machine:

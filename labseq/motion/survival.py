@@ -183,7 +183,7 @@ def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, losses: LossSpec) 
         atoms[row, col] = False
         hazards[:, row, col] = 0.0
         if batch.tones is not None:
-            for at in _landings(batch, batch.tones, atoms):
+            for at in landings(batch, batch.tones, atoms):
                 hazards[LANDED][at] -= math.log1p(-losses.landing)
                 n_landings += 1
             if losses.passing > 0:
@@ -220,7 +220,7 @@ def _batch_hazard(batch: Batch, grid: SiteGrid, losses: LossSpec) -> Floats:
     return -np.log1p(-loss)
 
 
-def _landings(batch: Batch, paths: TonePaths, atoms: Occupancy) -> list[tuple[int, int]]:
+def landings(batch: Batch, paths: TonePaths, atoms: Occupancy) -> list[tuple[int, int]]:
     """Sites of atoms that stand where an empty tweezer of a batch is ramped down."""
     landings: list[tuple[int, int]] = []
     carried = {(int(i), int(j)) for i, j in paths.tones_of(batch.from_sites)}

@@ -29,8 +29,13 @@ DARK, LIGHT, ORANGE, RED = "#1f4e8c", "#86b6e0", "#f28e2b", "#c8102e"
 """Colours of points and lines, of areas, of a second series, and of what they are compared with."""
 
 
-def check_place(path: Path, endings: Sequence[str] = ENDINGS) -> None:
+def check_place(path: Path, endings: Sequence[str] = ENDINGS, *, drawn: bool = True) -> None:
     """Check that a picture can be drawn and written, before any other work.
+
+    Args:
+        path: The file.
+        endings: The endings that its name may have.
+        drawn: Whether matplotlib draws it.
 
     Raises:
         ConfigError: The file has another ending, its folder does not exist, or matplotlib is not installed.
@@ -49,7 +54,7 @@ def check_place(path: Path, endings: Sequence[str] = ENDINGS) -> None:
     if is_odd:
         what = "this is a folder" if is_folder else "this is not an ordinary file"
         raise ConfigError(Problem(what, name, expected=wanted))
-    if not can_draw():
+    if drawn and not can_draw():
         what = "drawing a picture needs matplotlib, which is not installed"
         raise ConfigError(Problem(what, hint=install_hint("plot")))
 
@@ -108,7 +113,15 @@ def save_figure(path: Path, draw: Callable[[], Figure], **options: Any) -> None:
         ConfigError: The file cannot be written.
     """
     ending = path.suffix.lower()
-    data = encode_figure(draw, ending if ending in ENDINGS else ".png", **options)
+    save_bytes(path, encode_figure(draw, ending if ending in ENDINGS else ".png", **options))
+
+
+def save_bytes(path: Path, data: bytes) -> None:
+    """Save a picture that is drawn already, as a whole.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
     try:
         with whole_file(path) as file:
             file.write(data)

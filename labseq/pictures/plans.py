@@ -401,10 +401,19 @@ def check_picture(path: Path, shape: tuple[int, int]) -> None:
         ConfigError: The file has another ending than .png, its folder does not
             exist, the array is too large, or matplotlib is not installed.
     """
+    check_size(path, shape)
+    check_place(path, (".png",))
+
+
+def check_size(path: Path, shape: tuple[int, int]) -> None:
+    """Check that (n_rows, n_cols) sites can be told apart in a picture.
+
+    Raises:
+        ConfigError: They cannot.
+    """
     if max(shape) > MAX_SITES:
         what = f"{shape[0]} x {shape[1]} sites are too many for a picture"
         raise ConfigError(Problem(what, str(path), expected=f"at most {MAX_SITES} rows and columns"))
-    check_place(path, (".png",))
 
 
 def save_plan(path: Path, drawing: PlanDrawing) -> None:

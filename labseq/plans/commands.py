@@ -12,6 +12,7 @@ Examples:
   labseq plan random:20x20@0.75 --seed 1 --target "{pattern: kagome, rows: 15, cols: 15}" --dop 7
   labseq plan random:20x20@0.75 --seed 1 --target "{pattern: sierpinski, rows: 16, cols: 16}" --step
   labseq plan data/2026-11-20/0001_compact-225/shots/shot_000003.h5#1 --png second_cycle.png
+  labseq plan random:20x20@0.75 --target "{pattern: compact, rows: 15, cols: 15}" --animate plan.html
   labseq plan occupancy.npy --target "{pattern: ring, radius: 4}" --origin 2,3 --json - | jq .n_batches
 """
 WAVEFORM_EXAMPLES: Final = """\b
@@ -90,6 +91,14 @@ def plan(
     png: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw the plan, with an arrow for each atom move.")
     ] = None,
+    animate: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Show tweezers and atoms in time, as they are played: a GIF, or a page (.html) for a "
+            "browser.",
+        ),
+    ] = None,
     _plugins: Plugins = None,
 ) -> None:
     """Plan the moves for one occupancy, check the plan as a run does, and print or draw it.
@@ -100,7 +109,7 @@ def plan(
     from labseq.plans.plan import PlanOutput, plan_once
 
     request = PlanRequest(occupancy, target, planner, dop, tuple(overrides or ()), seed, origin, profile)
-    plan_once(request, PlanOutput(step=step, json=json, png=png))
+    plan_once(request, PlanOutput(step=step, json=json, png=png, animate=animate))
 
 
 def waveform(

@@ -34,28 +34,36 @@ class PlanOutput:
         step: Whether to print the plan batch by batch.
         json: Name of the file for the plan as JSON; "-" for stdout, which then holds nothing else.
         png: The file for the plan as a picture.
+        animate: The file for the plan as an animation.
     """
 
     step: bool = False
     json: str | None = None
     png: Path | None = None
+    animate: Path | None = None
 
 
 def plan_once(request: PlanRequest, output: PlanOutput) -> None:
     """Plan the moves for one occupancy, and print or write them."""
-    check_different(request.occupancy, output.json, output.png)
+    check_different(request.occupancy, output.json, output.png, output.animate)
     write = json_writer(output.json)
     source = read_source(request.occupancy, request.seed)
     if output.png is not None:
         from labseq.pictures.plans import check_picture
 
         check_picture(output.png, source.occupancy.shape)
+    if output.animate is not None:
+        from labseq.pictures.animations import check_animation
+
+        check_animation(output.animate, source.occupancy.shape)
     if source.occupancy.size <= 64 * 64:  # planning in plain Python is then faster than loading numba
         interpret()
     moves = plan_moves(request, source, announce=report_compiling, keep_refused=True)
     report = PlanReport.of(moves)
     if output.png is not None:
         _draw(moves, output.png)
+    if output.animate is not None:
+        _animate(moves, output.animate)
     if output.json != STDOUT:
         write(report)
     if output.step or output.json != STDOUT:
@@ -98,6 +106,17 @@ def _draw(moves: PlannedMoves, path: Path) -> None:
 
     content = moves.grid, moves.occupancy, moves.target, moves.plan, moves.report, moves.refused
     save_plan(path, PlanDrawing(title(moves), moves.source, *content))
+
+
+def _animate(moves: PlannedMoves, path: Path) -> None:
+    """Save the motion; of a refused plan, that of the batches before the refused one."""
+    from labseq.pictures.animations import Animation, save_animation
+    from labseq.pictures.playback import play_back
+
+    plan = moves.plan if moves.refused is None else moves.plan.first(moves.refused.batch)
+    content = plan, moves.occupancy, moves.target, moves.grid, moves.motion
+    playback = play_back(*content, end_s=moves.report.duration_s)
+    save_animation(path, Animation(title(moves), moves.source, playback))
 
 
 def batch_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> Iterator[list[Text]]:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -192,7 +193,7 @@ def test_a_refused_plan_is_shown_up_to_its_mistake(
 ) -> None:
     (tmp_path / "broken.py").write_text(BROKEN, "utf-8")
     monkeypatch.setenv("LABSEQ_PLUGIN_PATH", str(tmp_path))
-    png, saved = tmp_path / "a.png", tmp_path / "a.json"
+    png, saved, page = (tmp_path / name for name in ("a.png", "a.json", "a.html"))
     command = [
         "plan",
         "random:6x6@0.6",
@@ -200,7 +201,8 @@ def test_a_refused_plan_is_shown_up_to_its_mistake(
         "--target={pattern: compact, rows: 3, cols: 3}",
         "--planner=broken",
     ]
-    code, out, err = call(*command, f"--set=kind={kind}", f"--json={saved}", f"--png={png}")
+    outputs = f"--json={saved}", f"--png={png}", f"--animate={page}"
+    code, out, err = call(*command, f"--set=kind={kind}", *outputs)
     assert code == 1
     assert why in err
     document = json.loads(saved.read_text("utf-8"))
@@ -208,6 +210,7 @@ def test_a_refused_plan_is_shown_up_to_its_mistake(
     assert document["refused"].items() >= {"batch": 1, "move": move}.items()
     assert why in document["refused"]["why"]
     assert document["predicted"][1][:2] == [1, 0]
+    assert re.search(r'"batches":\[\[[\d.,]+\]\]', page.read_text("utf-8"))  # the one that is valid
     text = out.replace("→", "->")
     assert "batch 1  refused" in text
     assert why in text
@@ -256,7 +259,7 @@ def test_the_command_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, cal
     monkeypatch.setattr("labseq.plans.plan.plan_once", lambda *arguments: got.extend(arguments))
     target = ["--target", "{pattern: a, rows: 3, cols: 3}", "--origin", "-1,2"]
     planner = ["--planner", "p", "--dop", "4", "--set", "a=1", "--set", "b=2"]
-    output = ["--step", "--json", "-", "--png", "x.png"]
+    output = ["--step", "--json", "-", "--png", "x.png", "--animate", "y.gif"]
     assert call("plan", "-", *target, *planner, "--seed", "5", "-p", "lab", *output)[0] == 0
     request = PlanRequest("-", "{pattern: a, rows: 3, cols: 3}", "p", 4, ("a=1", "b=2"), 5, "-1,2", "lab")
-    assert got == [request, PlanOutput(step=True, json="-", png=Path("x.png"))]
+    assert got == [request, PlanOutput(True, "-", Path("x.png"), Path("y.gif"))]
