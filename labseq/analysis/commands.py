@@ -224,7 +224,8 @@ def plot(
     cycle: Annotated[
         int | None,
         typer.Option(
-            metavar="K", help="Only one cycle of that shot, counted from 0: the images before and after it."
+            metavar="K",
+            help="Only one cycle of that shot, counted from 0: the images before and after, or its motion.",
         ),
     ] = None,
     output: Annotated[
@@ -233,8 +234,9 @@ def plot(
             "--output",
             "-o",
             metavar="FILE",
-            help="A PNG, SVG or PDF file. Default: overview.png, shot-3.png, ... in the current folder, "
-            "with a number if there is such a file.",
+            help="A PNG, SVG or PDF file; with --shot also a GIF or a page (.html) of the motion in a "
+            "cycle. Default: overview.png, shot-3.png, ... in the current folder, with a number if "
+            "there is such a file.",
         ),
     ] = None,
     scan: ScanQuantities = None,

@@ -9,12 +9,14 @@ from pathlib import Path
 from labseq.analysis.campaigns import campaign_in, campaign_picture
 from labseq.analysis.overview import map_picture, overview, picture_of, scan_picture
 from labseq.analysis.scanned import ScanRequest
-from labseq.analysis.shot import save_shot, shot_picture
+from labseq.analysis.shot import save_shot, shot_animation, shot_picture
 from labseq.console.output import say
 from labseq.console.runs import chosen_run
 from labseq.errors import ConfigError, Problem
+from labseq.kernels.kernel import interpret
 from labseq.messages import visible
-from labseq.pictures.figures import check_place
+from labseq.pictures.animations import ENDINGS as ANIMATIONS, save_animation
+from labseq.pictures.figures import ENDINGS, check_place
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,8 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, rep
             Problem(problem, visible(str(folder)), expected="no option but --output and --force")
         )
     path = _free_name(request.name if folder is None else "campaign") if output is None else output
-    check_place(path)
+    ending = path.suffix.lower()
+    check_place(path, ENDINGS if request.shot is None else (*ENDINGS, *ANIMATIONS), drawn=ending != ".html")
     if path.exists() and not replace:
         hint = "--force replaces it"
         raise ConfigError(
@@ -86,7 +89,10 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, rep
         say(f"written: {path}")
         return
     opened_run = chosen_run(run, request.where)
-    if request.shot is not None:
+    if request.shot is not None and ending in ANIMATIONS:
+        interpret()  # plain Python is faster than loading the compiler for one cycle
+        save_animation(path, shot_animation(opened_run, request.shot, request.cycle))
+    elif request.shot is not None:
         save_shot(path, shot_picture(opened_run, request.shot, request.cycle))
     elif request.scan is not None:
         scan_picture(opened_run, request.scan).save(path)

@@ -15,6 +15,7 @@ from labseq.data.shot import Shot
 from labseq.errors import ConfigError, Problem
 from labseq.messages import clean
 from labseq.model import CycleRecord, ImageRecord, Occupancy, ShotRecord, SiteGrid, TargetPattern
+from labseq.pictures.animations import Animation
 from labseq.pictures.figures import (
     PANEL_IN,
     MarkerStyle,
@@ -33,12 +34,14 @@ from labseq.pictures.plans import (
     EMPTY_LOOK,
     RESERVOIR_LOOK,
     SURPLUS_LOOK,
+    check_size,
     frame,
     on_grid,
     paint_moves,
     paint_numbers,
     paint_sites,
 )
+from labseq.pictures.playback import play_back_cycle
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -280,6 +283,39 @@ def shot_picture(run: Run, index: int, cycle: int | None = None) -> ShotDrawing:
     )
 
 
+def shot_animation(run: Run, index: int, cycle: int | None = None) -> Animation:
+    """The motion in a cycle of a shot, and the atoms that were lost.
+
+    Args:
+        index: Index of the shot, from 0. Of one that did not complete, the last attempt.
+        cycle: The cycle, counted from 0 over all rearrangements of the shot; may be None if there is one.
+
+    Raises:
+        ConfigError: There is no such shot or cycle, none of several is named, or the array is too large.
+        RecordingError: The shot's file is damaged.
+    """
+    shot = _shot(run, index)
+    check_size(shot.file, run.target.shape)
+    n_cycles = len(shot.cycles)
+    if cycle is None and n_cycles > 1:
+        problem = f"shot {index} has {n_cycles} cycles, and an animation shows one"
+        raise ConfigError(Problem(problem, expected=f"--cycle with a number from 0 to {n_cycles - 1}"))
+    number = cycle or 0
+    if not 0 <= number < n_cycles:
+        raise _no_cycle(run, index, number, n_cycles)
+    playback = play_back_cycle(shot, number)
+    n_batches, n_lost = len(playback.batch_s), sum(atom.is_lost for atom in playback.atoms)
+    batches = f"{n_batches} batch{'es' * (n_batches != 1)}"
+    title = f"shot {index}, cycle {number}: {batches}, {n_lost} atom{'s' * (n_lost != 1)} lost"
+    return Animation(title, note_of(run), playback)
+
+
+def _no_cycle(run: Run, index: int, cycle: int, n_cycles: int) -> ConfigError:
+    expected = f"one from 0 to {n_cycles - 1}" if n_cycles else "a shot that rearranges"
+    problem = f"shot {index} of {clean(run.path.name)} has no cycle {cycle}"
+    return ConfigError(Problem(problem, "--cycle", expected=expected))
+
+
 def _shot(run: Run, index: int) -> Shot:
     attempts = [shot for shot in (*run.attempts, *run.shots) if shot.index == index]
     if not attempts:
@@ -326,8 +362,6 @@ def _of_cycle(
 ) -> list[ShotPanel]:
     ends = [i for i, image in enumerate(record.images) if image.cycle >= 0]
     if not 0 <= cycle < len(ends):
-        expected = f"one from 0 to {len(ends) - 1}" if ends else "a shot that rearranges"
-        problem = f"shot {index} of {clean(run.path.name)} has no cycle {cycle}"
-        raise ConfigError(Problem(problem, "--cycle", expected=expected))
+        raise _no_cycle(run, index, cycle, len(ends))
     after = ends[cycle]
     return panels[max(0, after - 1) : after + 1]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
+from labseq.analysis.plotting import PlotRequest, plot_run
 from labseq.analysis.shot import DPI, ShotDrawing, ShotPanel, save_shot, shot_picture
 from labseq.data.reader import Run
 from labseq.errors import ConfigError
@@ -16,6 +20,8 @@ from labseq.pictures.plans import ATOM_LOOK
 from tests.pictures.pixels import are_at, decoded, is_colour, on_lattice, spots
 
 from .records import SHAPE, Write, image, make_shot, target
+
+assert numba  # loaded already, so that no animation turns compiling off for the tests after it
 
 
 def test_every_image_has_a_panel_with_the_moves_that_followed(compact: Run) -> None:
@@ -95,3 +101,20 @@ def test_what_is_not_there_is_told(write: Write, index: int, cycle: int | None, 
     run = write([make_shot(0), make_shot(1, n_cycles=0)])
     with pytest.raises(ConfigError, match=reported):
         shot_picture(run, index, cycle)
+
+
+def test_a_cycle_of_a_recorded_shot_is_animated(compact: Run, tmp_path: Path) -> None:
+    page = tmp_path / "shot.html"
+    plot_run(compact.path, PlotRequest(shot=1, cycle=0), page)
+    cycle = compact.shots[1].cycles[0]
+    scene = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page.read_text("utf-8"))
+    assert scene is not None
+    assert len(json.loads(scene[1])["batches"]) == cycle.n_batches_played
+    for number, reported in (
+        (None, r"shot 1 has \d+ cycles.*expected --cycle with a number from 0 to"),
+        (99, "has no cycle 99; expected one from 0 to"),
+    ):
+        with pytest.raises(ConfigError, match=reported):
+            plot_run(compact.path, PlotRequest(shot=1, cycle=number), tmp_path / "other.gif")
+    with pytest.raises(ConfigError, match=r"ends in .png or .svg or .pdf$"):
+        plot_run(compact.path, PlotRequest(), tmp_path / "overview.gif")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +17,6 @@ from tests.pictures.pixels import are_at, is_colour, on_lattice, spots
 assert numba  # loaded already, so that no command turns compiling off for the tests after it
 
 PLAN = ("plan", "random:7x7@0.6", "--seed=3", "--target={pattern: checkerboard, rows: 4, cols: 4}")
-
-
-def scene_of(page: Path) -> dict[str, Any]:
-    """The motion that a page plays."""
-    found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page.read_text("utf-8"))
-    assert found is not None
-    return json.loads(found[1])
 
 
 def test_a_gif_begins_with_the_atoms_before_and_ends_with_those_after(tmp_path: Path, call: Any) -> None:
