@@ -36,6 +36,8 @@ PICTURES = {
     "fit": ("/scan?run={lifetime}", "light", 1280, 640),
     "phone": ("/now", "light", 390, 844),
 }
+PART_WAY = "one => { one.value = 0.7 * one.min + 0.3 * one.max; one.dispatchEvent(new Event('input')); }"
+"""Moves the slider of a player."""
 
 
 def run(data: Path, sequence: str, *options: str) -> Path:
@@ -105,6 +107,9 @@ def take(folder: Path = FOLDER, names: tuple[str, ...] = tuple(PICTURES), shots:
                 page.locator("main[aria-busy='false'] h1").first.wait_for()
                 if name == "fit":
                     page.locator(".fit-line strong").wait_for()
+                if name == "shot":
+                    page.get_by_role("button", name="Play cycle 0").click()
+                    page.locator(".player input").evaluate(PART_WAY)
                 page.wait_for_timeout(1500)  # frames are loaded one by one
                 picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
                 picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(

@@ -97,7 +97,7 @@ export function describe(scene, state, t) {
   return `${t.toFixed(3)} ms, ${where}${n ? `, ${n} tweezer${n > 1 ? "s" : ""}${empty ? `, ${empty} without an atom` : ""}` : ""}${lost ? `, ${lost} lost` : ""}`;
 }
 
-// A player of a scene, as labseq.pictures.playback writes it: its elements, and functions that draw and end it
+// A player of a scene, as labseq.pictures.playback writes it: its elements, and functions that draw and play it
 export function makePlayer(scene, colour) {
   const make = (tag, props) => Object.assign(document.createElement(tag), props);
   const canvas = make("canvas", {}), caption = make("p", { className: "note" }), extent = extentOf(scene);
@@ -118,7 +118,7 @@ export function makePlayer(scene, colour) {
   const tick = (now) => {
     t = Math.min(scene.end, t + ((now - last) / 1000) * scene.speed);
     [last, slider.value] = [now, t];
-    request = t < scene.end ? requestAnimationFrame(tick) : 0;
+    request = t < scene.end && canvas.isConnected ? requestAnimationFrame(tick) : 0;  // its page may have been left
     draw();
   };
   const play = () => {
@@ -129,5 +129,5 @@ export function makePlayer(scene, colour) {
   button.onclick = () => { if (request) { stop(); draw(); } else play(); };
   slider.oninput = () => { stop(); t = Number(slider.value); draw(); };
   const key = make("p", { className: "note", textContent: KEY });
-  return { elements: [canvas, controls, caption, key], draw, play, stop };
+  return { elements: [canvas, controls, caption, key], draw, play };
 }

@@ -21,6 +21,7 @@ from labseq.console.events import scanned_names, scanned_values
 from labseq.data.site_maps import site_map
 from labseq.errors import RecordingError
 from labseq.files import read_file
+from labseq.pictures.playback import play_back_cycle
 from labseq.plain import to_plain
 from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import read_state
@@ -70,6 +71,7 @@ class Api:
             Endpoint(f"{_RUN}/map", self.map, ("quantity",)),
             Endpoint(f"{_RUN}/shots", self.shots, ("first", "n")),
             Endpoint(f"{_RUN}/shots/{{shot}}", self.shot, ("attempt",)),
+            Endpoint(f"{_RUN}/shots/{{shot}}/motion/{{cycle}}", self.motion, ("attempt",)),
             Endpoint(
                 f"{_RUN}/shots/{{shot}}/frames/{{image}}.png", self.frame, ("attempt", "width"), "image/png"
             ),
@@ -232,6 +234,17 @@ class Api:
         values = shot_values(run.shot(line), str(record.get("record_frames")))
         status, error = read_state(run.folder)
         return {"run": head_of(run, record, status, error), "shot": values}
+
+    def motion(self, request: Request) -> Any:
+        """Tones and atoms of a cycle in time, with the atoms that were lost; places in sites, times in ms.
+
+        A tone is a list of [time, place, depth] and an atom one of [time, row, column], straight in between;
+        a tweezer is at each crossing of tones that are on. `fates` are null for an atom that is kept, else
+        how and when it goes: ejected, lost, or missing on the next image. `cycle` counts all of the shot.
+        """
+        run = self._opened(request)
+        shot = run.shot(self._line(run, request))
+        return play_back_cycle(shot, _number(request.path_params, "cycle", 0)).as_json()
 
     async def frame(self, request: Request) -> Response:
         """A frame of a shot in 8 bit, its darkest pixels black and its brightest white."""

@@ -6,6 +6,7 @@ import importlib
 import mimetypes
 import threading
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +24,7 @@ from labseq.web.runs import Catalogue
 from labseq.web.state import Limits
 
 STATIC: Final = Path(__file__).parent / "static"
+PLAYER: Final = Path(str(files("labseq.pictures") / "player.js"))
 PAGES: Final = (
     *("/", "/now", "/scan", "/runs", "/compare", "/queue", "/calibrations", "/api"),
     *("/runs/{day}/{name}", "/runs/{day}/{name}/shots/{shot}"),
@@ -45,14 +47,15 @@ def make_app(root: Path, access: Access | None = None, limits: Limits | None = N
     Image.preinit()  # takes 0.1 s, likewise
     threading.Thread(target=catalogue.warm, daemon=True).start()
     api = Api(catalogue, limits or Limits(), Actions(catalogue).endpoints() if allowed.may_act else ())
-    files = {path.name: _read_static(path) for path in sorted(STATIC.iterdir()) if path.suffix in _KINDS}
-    page = files["index.html"]
+    paths = (*sorted(STATIC.iterdir()), PLAYER)
+    static = {path.name: _read_static(path) for path in paths if path.suffix in _KINDS}
+    page = static["index.html"]
 
     async def show_page(_: Request) -> Response:
         return _respond_with(page)
 
     async def show_file(request: Request) -> Response:
-        file = files.get(request.path_params["file"])
+        file = static.get(request.path_params["file"])
         return _respond_with(file) if file is not None else PlainTextResponse("there is no such file\n", 404)
 
     async def show_api(_: Request) -> Response:

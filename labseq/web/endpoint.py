@@ -27,6 +27,7 @@ _DESCRIPTIONS: Final = {
     "name": "name of the run's folder, 0001_compact-225",
     "shot": "index of the shot, from 0",
     "image": "index of the image in the shot, from 0",
+    "cycle": "index of the cycle in the shot, from 0",
     "attempt": "an attempt that does not count; by default the one that counts",
     "quantity": "what to show at the points of the scan: survival:before,after@target; by default what the "
     "run measures",
@@ -122,7 +123,7 @@ def describe(endpoint: Endpoint) -> dict[str, Any]:
 
 
 def _parameter(name: str, place: str) -> dict[str, Any]:
-    is_number = name in ("shot", "image", "attempt", "first", "n", "width")
+    is_number = name in ("shot", "image", "cycle", "attempt", "first", "n", "width")
     return {
         "name": name,
         "in": place,

@@ -64,6 +64,7 @@ def serve(data: Path | None, serving: Serving) -> None:
     check_packages()
     import uvicorn
 
+    from labseq.kernels.kernel import interpret
     from labseq.session.notices import FREE_GB, NoticeSettings
     from labseq.web.app import make_app
     from labseq.web.state import Limits
@@ -79,6 +80,7 @@ def serve(data: Path | None, serving: Serving) -> None:
     is_open = is_loopback(serving.host) and not serving.names
     token = "" if is_open and not serving.control else find_token()
     listener = _listener(serving.host, serving.port)
+    interpret()  # plain Python is fast enough for the motion of one cycle, and numba takes 100 MB
     app = make_app(root, Access(token, server_names(serving.names), serving.control), limits)
     for line in _greeting(root, serving, listener.getsockname()[1], token):
         say(line)

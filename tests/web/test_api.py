@@ -84,13 +84,20 @@ def test_every_address_of_the_description_answers(client: Any, run_dir: Path) ->
     described = answers(client, "/api/v1/openapi.json")["paths"]
     values = {"day": run_dir.parent.name, "name": run_dir.name, "shot": "0", "image": "0", "kind": "sequence"}
     for path, methods in described.items():
-        if path.endswith("/events") or "{store}" in path:
+        if path.endswith(("/events", "/motion/{cycle}")) or "{store}" in path:
             continue
         answer = client.get(path.format(**values))
         assert answer.status_code == 200, (path, answer.text)
         (kind,) = methods["get"]["responses"]["200"]["content"]
         assert answer.headers["content-type"].startswith(kind)
         assert methods["get"]["summary"]
+
+
+def test_a_run_without_settings_has_no_motion(client: Any, run_dir: Path) -> None:
+    """The motion of a run in the virtual lab is compared in a browser, see ``test_browser.py``."""
+    answer = client.get(f"{path_of(run_dir)}/shots/0/motion/0")
+    assert answer.status_code == 409
+    assert "does not say what the shot was taken with" in answer.json()["error"]
 
 
 def test_a_frame_is_shown_from_black_to_white_at_every_size(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ import labseq
 from labseq.calibration_store import Store
 from labseq.data.reader import open_run
 from labseq.model import CalibrationEntry, SiteGrid, grid_facts
+from labseq.pictures.playback import play_back_cycle
 from labseq.queue.queue import Queue
 from tests.recording.records import make_shot
 
@@ -228,6 +229,64 @@ def test_frames_are_seen_as_they_were_taken(server: Server, watched: Watched) ->
     assert canvas.evaluate(GREYS, [*greys]) == pytest.approx([*greys.values()], abs=2)
 
 
+def time_of(page: Any) -> float:
+    """The time that a player shows, in ms."""
+    return float(page.locator(".player + p").inner_text().partition(" ms")[0])
+
+
+def check_that_a_player_moves(page: Any) -> None:
+    """It plays from its start to its end, stands when it is told to, and follows its slider."""
+    button, slider = page.locator(".player button"), page.locator(".player input")
+    first = time_of(page)
+    page.wait_for_function(
+        "first => parseFloat(document.querySelector('.player + p').textContent) > first", arg=first
+    )
+    button.click()
+    expect(button).to_have_text(re.compile("Play"))
+    stands = time_of(page)
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    assert time_of(page) == stands
+    before = page.locator("canvas").first.evaluate("one => one.toDataURL()")
+    slider.evaluate("one => { one.value = one.max; one.dispatchEvent(new Event('input')); }")
+    expect(page.locator(".player + p")).to_have_text(re.compile("after the last batch"))
+    assert page.locator("canvas").first.evaluate("one => one.toDataURL()") != before
+
+
+STATES = """async ([address, path, places]) => {
+    const { stateAt } = await import(address);
+    const scene = await (await fetch(path)).json();
+    return places.map((part) => stateAt(scene, scene.start + part * (scene.end - scene.start)));
+}"""
+
+
+def check_that_a_cycle_is_played(full: Server, page: Any, run: Path) -> None:
+    """What the page draws is what the motion's own evaluation says, at any time."""
+    base = f"http://127.0.0.1:{full.port}"
+    path = f"/runs/{run.parent.name}/{run.name}/shots/1"
+    page.goto(f"{base}{path}")
+    page.get_by_role("button", name="Play cycle 0").click()
+    check_that_a_player_moves(page)
+    playback, parts = play_back_cycle(open_run(run).shots[1], 0), np.linspace(0.0, 0.999, 60).tolist()
+    states = page.evaluate(STATES, [f"{base}/static/player.js", f"/api/v1{path}/motion/0", parts])
+    for part, state in zip(parts, states, strict=True):
+        frame = playback.at(playback.start_s + part * (playback.end_s - playback.start_s))
+        assert state["batch"] == frame.batch, part
+        assert np.array(state["atoms"]) == pytest.approx(frame.atoms, abs=1e-4)
+        tweezers = np.array(state["tweezers"], float).reshape(-1, 4)
+        assert tweezers == pytest.approx(frame.tweezers, abs=1e-4)
+
+
+def test_a_page_of_a_plan_plays_without_a_server(tmp_path: Path, watched: Watched) -> None:
+    path, page = tmp_path / "plan.html", watched.page
+    target = "--target={pattern: compact, rows: 5, cols: 5}"
+    command = [sys.executable, "-m", "labseq", "plan", "random:8x8@0.7", "--seed=1", "--planner=grid"]
+    subprocess.run([*command, target, f"--animate={path}"], check=True, stdout=subprocess.DEVNULL)
+    page.goto(path.as_uri())
+    page.get_by_role("button").click()
+    check_that_a_player_moves(page)
+    assert watched.faults == [path.as_uri()]  # and no other file
+
+
 RUN = """
 import sys, time
 from pathlib import Path
@@ -388,6 +447,7 @@ def test_pages_of_a_folder_with_something_for_each(full: Server, watched: Watche
     assert watched.faults == []
     run = next(run.parent for run in full.data.glob("*/*scan-dop/run.json"))
     check_that_a_link_leads_to_the_same_shot_with_its_images_and_moves(full, page, run)
+    check_that_a_cycle_is_played(full, page, run)
     check_that_a_table_is_sorted_by_a_click(full, page, run)
     check_that_any_quantity_can_be_chosen(full, page, run)
     check_that_a_comment_is_kept_and_found(full, page, run)

@@ -1,24 +1,12 @@
 // Draws the array: sites, atoms, defects and moves; and frames with their sites.
 import { colour } from "./dom.js";
+import { prepared } from "./player.js";
 
 export function positions(lattice) {
   const found = [], shift = lattice.kind === "square" ? 0 : 0.5 * lattice.shear, height = lattice.kind === "square" ? 1 : Math.sqrt(3) / 2;
   for (let row = 0; row < lattice.rows; row++)
     for (let col = 0; col < lattice.cols; col++) found.push([col + row * shift, row * height]);
   return found;
-}
-
-function prepared(canvas, ratio) {
-  const width = Math.max(80, canvas.clientWidth), dpr = Math.min(2, devicePixelRatio || 1);
-  const height = Math.round(width * ratio);
-  if (canvas.width !== Math.round(width * dpr) || canvas.height !== Math.round(height * dpr)) {
-    canvas.width = Math.round(width * dpr);
-    canvas.height = Math.round(height * dpr);
-  }
-  const ctx = canvas.getContext("2d");
-  ctx.setTransform(dpr, 0, 0, dpr, 0, 0);
-  ctx.clearRect(0, 0, width, height);
-  return [ctx, width, height];
 }
 
 // occupancy, fill: texts of 0 and 1 per row; batches: lists of [row, col, row, col]

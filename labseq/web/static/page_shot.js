@@ -1,7 +1,8 @@
 // One shot: all frames, and its moves cycle by cycle.
 import { go } from "./app.js";
 import { drawArray, drawFrame } from "./array.js";
-import { count, el, facts, getJson, panel, percent, replace, runLink, runPath, table, time } from "./dom.js";
+import { colour, count, el, facts, getJson, panel, percent, replace, runLink, runPath, table, time } from "./dom.js";
+import { makePlayer } from "./player.js";
 
 export async function showShot(main, [day, name, number], asked) {
   const id = `${day}/${name}`, attempt = asked.get("attempt");
@@ -13,7 +14,7 @@ export async function showShot(main, [day, name, number], asked) {
   const draws = [];
   replace(main, el("div.title-line", {}, el("h1", {}, `Shot ${shot.shot}`), el("span.tag", {}, outcome), attempt !== null ? el("span.tag", {}, `attempt ${shot.attempt}`) : null, step(-1), step(1)),
     el("div.sub-line", {}, runLink(id), el("span", {}, `${count(shot.images.length, "image")}, ${count(shot.cycles.length, "cycle")}`), el("a", { href: `/api/v1${base}${suffix ? `?${suffix}` : ""}` }, "as JSON")),
-    el("div.grid", {}, shot.cycles.length ? cyclesPanel(run, shot, draws) : null, framesPanel(run, shot, base, suffix, draws),
+    el("div.grid", {}, shot.cycles.length ? cyclesPanel(run, shot, base, suffix, draws) : null, framesPanel(run, shot, base, suffix, draws),
       panel("Stages", { class: "half tall" }, stages(shot)), panel("Readings", { class: "half" }, orNone(shot.readings)), panel("Settings of this shot", { class: "half" }, orNone(shot.parameters)), panel("Calibrations", { class: "half" }, orNone(shot.calibrations))));
   const draw = () => draws.forEach((one) => one());
   draw();
@@ -30,8 +31,8 @@ export async function showShot(main, [day, name, number], asked) {
 
 function orNone(values) { return Object.keys(values).length ? facts(values) : el("p.hint", {}, "none"); }
 
-function cyclesPanel(run, shot, draws) {
-  const figures = shot.cycles.map((cycle) => {
+function cyclesPanel(run, shot, base, suffix, draws) {
+  const figures = shot.cycles.map((cycle, k) => {
     const at = shot.images.findIndex((one) => one.step === cycle.step && one.cycle === cycle.cycle);
     const before = shot.images[at > 0 ? at - 1 : 0], after = shot.images[at], moves = cycle.batches.slice(0, cycle.n_batches_played);
     const canvas = el("canvas", { role: "img" });
@@ -45,7 +46,20 @@ function cyclesPanel(run, shot, draws) {
       canvas.setAttribute("aria-label", caption.textContent);
     };
     draws.push(draw);
-    return el("figure", {}, canvas, moves.length > 1 ? slider : null, caption);
+    const button = el("button.play", { type: "button", onclick: async () => {
+      button.disabled = true;
+      try {
+        const player = makePlayer(await getJson(`${base}/motion/${k}${suffix ? `?${suffix}` : ""}`), colour);
+        slider.value = moves.length;
+        draw();
+        replace(figure, ...player.elements, caption);
+        figure.className = "playing";
+        draws[draws.indexOf(draw)] = player.draw;
+        player.play();
+      } catch (error) { replace(button, `cannot be played: ${error.message}`); }
+    } }, `▶ Play cycle ${cycle.cycle}`);
+    const figure = el("figure", {}, canvas, moves.length > 1 ? slider : null, caption, moves.length ? button : null);
+    return figure;
   });
   return panel("Cycle by cycle", { class: "wide" }, el("div.figures.many", {}, figures));
 }
