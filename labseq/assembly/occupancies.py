@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.array_files import ARRAY_FILES, opened_array, split_name
+from labseq.assembly.recorded import profile_of_shot
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import clean, did_you_mean, shown, visible
 from labseq.model import CycleRecord, ImageRecord, Occupancy, TargetPattern, as_occupancy
@@ -304,7 +305,8 @@ def _shot(path: Path, cycle: str | None) -> Source:
     if seen is None:
         raise ConfigError(Problem(f"there is no image before cycle {index}", name, expected="one"))
     label = f"{name}, before cycle {index}"
-    machine = cast("dict[str, Any]", content.run["resolved"] or {}).get("profile")
+    resolved = cast("dict[str, Any]", content.run["resolved"] or {})
+    machine = profile_of_shot(resolved, content.record.parameters) if resolved.get("profile") else None
     return Source(seen.occupancy, label, target=content.target, machine=machine)
 
 

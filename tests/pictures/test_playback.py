@@ -13,6 +13,7 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.strategies import DataObject
 
 import labseq
+from labseq.assembly.occupancies import read_source
 from labseq.assembly.planning import PlanRequest, plan_moves
 from labseq.data.shot import Shot
 from labseq.errors import RecordingError
@@ -150,6 +151,10 @@ def test_each_shot_is_played_at_its_own_speed(run: labseq.Run) -> None:
             playback = play_back_cycle(shot, index)
             played_s = cycle.report.batch_end_s[: cycle.n_batches_played]
             assert playback.batch_s[:, 1] == pytest.approx(played_s)
+        speed = shot.parameters["profile.mobile_tweezers.speed"]
+        planned_again = read_source(str(shot.file)).machine
+        assert planned_again is not None
+        assert planned_again["mobile_tweezers"]["speed"] == speed
     assert len({shot.parameters["profile.mobile_tweezers.speed"] for shot in run.shots}) == 2
     with pytest.raises(RecordingError, match="has no cycle 99; it has"):
         play_back_cycle(run.shots[0], 99)
