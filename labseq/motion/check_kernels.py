@@ -27,8 +27,10 @@ from labseq.motion.path_kernels import (
     check_axis,
     check_ends,
     check_motion,
-    leg_way,
+    fill_stands_from,
+    leg_ways,
     paths_of,
+    tracks_of,
 )
 
 Bools = NDArray[np.bool_]
@@ -282,8 +284,8 @@ def check_sources(batch: Moves, n_rows: int, n_cols: int) -> Fault:
 
 
 @helper_kernel(
-    f"{FAULT}({MOVES}, {POSITIONS}, {KNOTS}, UniTuple(int64, 3), {ATOMS}, {STAMPS}, {STAMPS}, {STAMPS},"
-    f" int64, int64, int64, int64, int64, {POSITIONS})"
+    f"Tuple(({FAULT}, float64))({MOVES}, {POSITIONS}, {KNOTS}, UniTuple(int64, 3), {ATOMS}, {STAMPS},"
+    f" {STAMPS}, {STAMPS}, int64, int64, int64, int64, int64, {POSITIONS})"
 )
 def check_path_batch(
     batch: Moves,
@@ -293,32 +295,38 @@ def check_path_batch(
     atoms: Bools,
     lifted: Stamps,
     goals: Stamps,
-    dropped: Stamps,
+    stands_from: Stamps,
     stamp: int,
     max_tweezers: int,
     max_row_tones: int,
     max_column_tones: int,
     slots: int,
     geometry: Floats,
-) -> Fault:
-    """Test a batch with paths of tones; without a fault the last number is that of tweezers."""
+) -> tuple[Fault, float]:
+    """Test a batch with paths of tones; without a fault the last number is that of tweezers.
+
+    The second result is the sum of the longest ways of all legs, in sites.
+    """
     counted = count_tones(shape, max_tweezers, max_row_tones, max_column_tones)
-    fault = counted
-    for axis in range(2):
-        if fault[0] == RIGHT:
-            fault = check_axis(positions, off, shape, axis, atoms.shape[axis], slots, geometry[2])
+    if counted[0] != RIGHT:
+        return counted, 0.0
+    tracks = tracks_of(positions, shape)
+    fault = check_axis(tracks[0], off[: shape[1]], 0, atoms.shape[0], slots, geometry[2])
+    if fault[0] == RIGHT:
+        fault = check_axis(tracks[1], off[shape[1] :], 1, atoms.shape[1], slots, geometry[2])
     if fault[0] == RIGHT:
         fault = check_sources(batch, atoms.shape[0], atoms.shape[1])
     if fault[0] == RIGHT:
         fault = check_sites(batch, 0, atoms, lifted, goals, stamp, False)
     if fault[0] == RIGHT:
-        fault = check_ends(batch, positions, off, shape, dropped)
+        fill_stands_from(atoms, lifted, stamp, stands_from)
+        fault = check_ends(batch, tracks, off, stands_from)
     if fault[0] == RIGHT:
-        fault = check_motion(
-            positions, off, shape, atoms, lifted, goals, dropped, stamp,
-            geometry[0], geometry[1], geometry[3] > 0.0,
-        )  # fmt: skip
-    return fault if fault[0] != RIGHT else counted
+        clearance, cosine, may_land = geometry[0], geometry[1], geometry[3] > 0.0
+        fault = check_motion(tracks, off, lifted, stands_from, stamp, clearance, cosine, may_land)
+    if fault[0] != RIGHT:
+        return fault, 0.0
+    return counted, leg_ways(tracks, off, geometry[1]).sum()
 
 
 @helper_kernel(
@@ -357,14 +365,16 @@ def check_lines_of_batch(
     return fault if fault[0] != RIGHT else counted
 
 
-@helper_kernel(f"UniTuple(float64, 2)({POSITIONS}, {KNOTS}, UniTuple(int64, 3), float64)")
-def path_lengths(positions: Floats, off: Stamps, shape: Shape, cosine: float) -> tuple[float, float]:
-    """Sum of the longest ways of all legs, in sites, and the number of knots at which tones go off."""
-    ways, drops = 0.0, 0.0
-    for leg in range(shape[0] - 1):
-        ways += leg_way(positions, off, shape, cosine, leg)
-        drops += (off == leg + 1).any()
-    return ways, drops
+@helper_kernel(f"float64({KNOTS})")
+def count_drops(off: Stamps) -> float:
+    """Number of knots at which tones go off."""
+    drops = 0.0
+    for tone in range(len(off)):
+        is_first = True
+        for before in range(tone):
+            is_first = is_first and off[before] != off[tone]
+        drops += is_first
+    return drops
 
 
 @kernel(
@@ -413,7 +423,7 @@ def check(
     n_batches, n_before = len(linked), 0
     lifted = np.zeros(atoms.shape, np.int32)
     goals = np.zeros(atoms.shape, np.int32)
-    dropped = np.zeros(atoms.shape if len(paths[0]) else (0, 0), np.int32)
+    stands_from = np.zeros(atoms.shape if len(paths[0]) else (0, 0), np.int32)
     row_goal = np.empty(atoms.shape[0], np.int64)
     column_goal = np.empty(atoms.shape[1], np.int64)
     ejected = had_paths = False
@@ -436,8 +446,8 @@ def check(
         had_paths = shape[0] + shape[1] + shape[2] > 0
         if had_paths:
             start, off_start = start + len(positions), off_start + len(off)
-            fault = check_path_batch(
-                batch, positions, off, shape, atoms, lifted, goals, dropped, stamp,
+            fault, way = check_path_batch(
+                batch, positions, off, shape, atoms, lifted, goals, stands_from, stamp,
                 max_tweezers, max_row_tones, max_column_tones, slots, geometry,
             )  # fmt: skip
         else:
@@ -445,16 +455,14 @@ def check(
                 batch, n_before, atoms, lifted, goals, row_goal, column_goal, stamp, follows, leads,
                 max_tweezers, max_row_tones, max_column_tones, slots,
             )  # fmt: skip
+            way = float(longest_move(batch))
         n_tweezers[number] = fault[3]
         if fault[0] != RIGHT:
             return fault[0], number, fault[1], fault[2], fault[3]
         ejected = move_atoms(batch, atoms)
         n_before = len(batch)
-        if had_paths:
-            ways, drops = path_lengths(positions, off, shape, geometry[1])
-        else:
-            ways, drops = float(longest_move(batch)), 0.0 if leads else 1.0
+        drops = count_drops(off) if had_paths else 0.0 if leads else 1.0
         time_s += 0.0 if follows else times_s[1] + times_s[2]
-        time_s += ways * times_s[3] + drops * times_s[4]
+        time_s += way * times_s[3] + drops * times_s[4]
         end_s[number] = time_s
     return RIGHT, -1, -1, 0, 0

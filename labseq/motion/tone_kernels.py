@@ -14,7 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.kernels.kernel import const, helper_kernel, kernel
-from labseq.motion.path_kernels import KNOTS, PATHS, POSITIONS, Paths, Shape, leg_way, paths_of, position
+from labseq.motion.path_kernels import (
+    KNOTS,
+    PATHS,
+    POSITIONS,
+    Paths,
+    Shape,
+    leg_ways,
+    paths_of,
+    position,
+    tracks_of,
+)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -377,8 +387,9 @@ def add_path_batch(
             values[START_AMPLITUDE, first:n] *= start
             values[END_AMPLITUDE, first:n] *= end
             m = add_segment(segments, m, PICK_UP, LINEAR, batch, took_s, n)
+    ways = leg_ways(tracks_of(positions, shape), off, cosine)
     for leg in range(last):
-        took_s, at = leg_way(positions, off, shape, cosine, leg) * site_s, leg + 1
+        took_s, at = ways[leg] * site_s, leg + 1
         if took_s > 0.0:
             n = add_path_tones(values, n, sites, of, leg, at, 1.0, 1.0, 1.0, took_s, phase)
             m = add_segment(segments, m, TRANSPORT, course, batch, took_s, n)

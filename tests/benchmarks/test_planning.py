@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from labseq_grid.planner import GridPlanner, GridSettings
 from labseq_psca.planner import PscaPlanner, PscaSettings
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -43,13 +44,18 @@ def squared_distances(atoms: Bools, target: TargetPattern) -> NDArray[np.int64]:
 class Case:
     """One loading, its plan, and all that is needed to make and check it."""
 
-    def __init__(self, n_grid: int, n_target: int, dop: int) -> None:
+    def __init__(self, n_grid: int, n_target: int, dop: int, lanes: str = "") -> None:
         self.dop = dop
         self.atoms, self.target = loading(n_grid), compact(n_grid, n_target)
         self.grid = SiteGrid(n_grid, n_grid)
         self.motion = MotionSpec(max_row_tones=n_grid, max_column_tones=n_grid)
         context = Context(grid=self.grid, motion=self.motion)
-        self.planner = PscaPlanner(PscaSettings(degree_of_parallelism=dop), context)
+        self.planner: PscaPlanner | GridPlanner = PscaPlanner(
+            PscaSettings(degree_of_parallelism=dop), context
+        )
+        if lanes:
+            settings = GridSettings.model_validate({"degree_of_parallelism": dop, "lanes": lanes})
+            self.planner = GridPlanner(settings, context)
         self.planner.warm()
         self.plan = self.make_plan()
 
@@ -77,6 +83,16 @@ def test_psca(benchmark: Any, size: str, dop: int) -> None:
 def test_playing(benchmark: Any, work: str, dop: int) -> None:
     benchmark.group = PAPER
     case = Case(*SIZES[PAPER], dop)
+    call: Callable[[], Any] = getattr(case, work)
+    assert benchmark(call) is not None
+
+
+@pytest.mark.parametrize("work", ["make_plan", "check", "tones"])
+@pytest.mark.parametrize("lanes", ["straight", "weaving"])
+def test_lanes(benchmark: Any, work: str, lanes: str) -> None:
+    """The check of paths at most twice as long as that of lines, in lanes that weave four times."""
+    benchmark.group = PAPER
+    case = Case(*SIZES[PAPER], 15, lanes)
     call: Callable[[], Any] = getattr(case, work)
     assert benchmark(call) is not None
 

@@ -102,6 +102,28 @@ def test_each_rule(rule: str, words: str, atoms: str, moves: Any, tones: TonePat
     assert error.value.rule == rule
 
 
+@pytest.mark.parametrize("grid", [SiteGrid(3, 3), SiteGrid(3, 3, shear=-1), SiteGrid(3, 3, lattice="square")])
+def test_short_legs_towards_an_atom_and_back(grid: SiteGrid) -> None:
+    """From any side, and just as near as is allowed, or a thousandth nearer."""
+    to_lines = np.linalg.inv(grid.axes) * grid.spacing_m  # of x, y in spacings: column, row
+    corner = np.array([-1.0, -1.0]) @ grid.axes / grid.spacing_m
+    clearance = MotionSpec().clearance_m / grid.spacing_m
+    first = float(np.arctan2(corner[1], corner[0]))
+    for part in range(48):
+        around = np.linspace(first, first + 2 * np.pi * part / 48, 60)
+        for nearest in (1.001, 0.999):
+            radius = np.concatenate([np.full(60, 0.7), np.linspace(0.7, nearest * clearance, 5)])
+            angle = np.concatenate([around, np.full(5, around[-1])])
+            there = 1.0 + (radius * np.array([np.cos(angle), np.sin(angle)])).T @ to_lines
+            column, row = np.concatenate([[[0, 0]], there, there[::-1], [[0, 0]]]).T[:, :, None]
+            visit = batch([(0, 0, 0, 0)], TonePaths(row, column))
+            if nearest > 1.0:
+                assert check("#.. .#. ...", visit, grid=grid).predicted.sum() == 2
+                continue
+            with pytest.raises(InvalidPlanError, match=r"stands on \(1, 1\)"):
+                check("#.. .#. ...", visit, grid=grid)
+
+
 def test_an_empty_tweezer_may_land_where_the_machine_allows_it() -> None:
     landing = batch([(0, 0, 0, 1)], along([0, 2], [1, 3]))
     assert check("#..#", landing, empty_tweezers_may_land=True).predicted.tolist() == grid_of(".#.#").tolist()
