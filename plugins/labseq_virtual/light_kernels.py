@@ -25,8 +25,8 @@ Ints = NDArray[np.int64]
 Records = Any
 """An array of records: numpy has no type for one that knows its columns."""
 
-FRAMES_PER_TRANSIT: Final = 4
-HALF: Final = 3
+FRAMES_PER_TRANSIT: Final = 8
+HALF: Final = 6
 """Frames from the middle of the beam to its edge, three standard deviations, where the sound is left out."""
 BEAM: Final = np.exp(-0.5 * (np.arange(-HALF, HALF + 1) * 4 / FRAMES_PER_TRANSIT) ** 2)
 WEIGHT: Final = BEAM / BEAM.sum()
