@@ -2,7 +2,7 @@
 
     python docs/make_survival_table.py --shots 1000
 
-In each of nine settings, shots are loaded, planned on the true occupancy, played, and followed by one
+In each setting, shots are loaded, planned on the true occupancy, played, and followed by one
 exposure. Counted are the atoms that the moves, the exposure and the vacuum take until its end,
 and the shots whose target is then whole; predicted are both for the same plans.
 """
@@ -14,7 +14,7 @@ import re
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from labseq_grid.planner import GridPlanner, GridSettings
@@ -30,8 +30,6 @@ from labseq.plugin import Context, DepthRamp, RandomStream, SiteGrid
 
 PAGE: Final = Path(__file__).parent / "explanation" / "survival.md"
 EXPOSURE_S: Final = 45e-3
-GRID: Final = SiteGrid()
-TARGET: Final = pattern(np.ones((15, 15), np.bool_), GRID, name="compact 15 x 15")
 PLANNERS: Final[dict[str, Any]] = {"psca": (PscaPlanner, PscaSettings), "grid": (GridPlanner, GridSettings)}
 
 
@@ -43,23 +41,33 @@ class Setting:
     parallel: int
     losses: dict[str, float] = field(default_factory=dict)
     loading: float = 0.75
-    speed_m_s: float = 0.130
+    lanes: str = "weaving"
+    path_depth: float = 1.0
+    lattice: Literal["triangular", "square"] = "triangular"
 
     @property
     def name(self) -> str:
         """The line's first column."""
         changed = [f"{key} {value:g}" for key, value in self.losses.items()]
         changed += [f"loading {self.loading:g}"] * (self.loading != 0.75)
-        changed += [f"speed {1e3 * self.speed_m_s:g} um/ms"] * (self.speed_m_s != 0.130)
+        changed += [self.lanes] * (self.planner == "grid" and self.lattice == "triangular")
+        changed += [f"path_depth {self.path_depth:g}"] * (self.path_depth != 1.0)
+        changed += [self.lattice] * (self.lattice != "triangular")
         return ", ".join([f"`{self.planner}`, {self.parallel} tweezers", *changed])
 
 
 SETTINGS: Final = (
     Setting("psca", 7),
     Setting("psca", 15),
+    Setting("grid", 2),
     Setting("grid", 7),
     Setting("grid", 15),
-    Setting("grid", 20),
+    Setting("grid", 15, path_depth=0.8),
+    Setting("grid", 15, lanes="straight"),
+    Setting("grid", 15, lanes="straight", path_depth=0.8),
+    Setting("grid", 15, lanes="straight", path_depth=0.6),
+    Setting("psca", 7, lattice="square"),
+    Setting("grid", 15, lattice="square"),
     Setting("grid", 15, {"move": 0.005}),
     Setting("grid", 15, {"spread": 0.0}),
     Setting("grid", 15, {"lifetime_s": 15.0}),
@@ -70,7 +78,8 @@ SETTINGS: Final = (
 def measure(setting: Setting, n_shots: int) -> dict[str, tuple[Estimate, Estimate]]:
     """Simulated and predicted, for atoms lost and shots without a defect."""
     losses = replace(LossSpec(image=0.00314), **setting.losses)
-    motion = MotionSpec(losses=losses, speed_m_s=setting.speed_m_s)
+    motion, grid = MotionSpec(losses=losses, path_depth=setting.path_depth), SiteGrid(lattice=setting.lattice)
+    target = pattern(np.ones((15, 15), np.bool_), grid, name="compact 15 x 15")
     settings = SimulationSettings.model_validate(
         {
             "transport_loss": losses.move,
@@ -81,14 +90,14 @@ def measure(setting: Setting, n_shots: int) -> dict[str, tuple[Estimate, Estimat
         }
     )
     random = RandomStream(1)
-    simulation = VirtualSimulation(settings, Context("simulation", GRID, motion, random=random))
+    simulation = VirtualSimulation(settings, Context("simulation", grid, motion, random=random))
     simulation.open()
     simulation.play("static_tweezers", DepthRamp(0.0, 1.0), 0.0)
     planner_class, settings_class = PLANNERS[setting.planner]
     options: dict[str, Any] = {"degree_of_parallelism": setting.parallel}
     if setting.planner == "grid":
-        options["lanes"] = "weaving"
-    planner = planner_class(settings_class.model_validate(options), Context(grid=GRID, motion=motion))
+        options["lanes"] = setting.lanes
+    planner = planner_class(settings_class.model_validate(options), Context(grid=grid, motion=motion))
     found: list[tuple[float, ...]] = []
     for shot in range(n_shots):
         now_s = 100.0 * shot
@@ -96,20 +105,20 @@ def measure(setting: Setting, n_shots: int) -> dict[str, tuple[Estimate, Estimat
         simulation.begin_shot()
         simulation.load(now_s, 1.0)
         before = simulation.truth()
-        if before.sum() < TARGET.n_atoms:
+        if before.sum() < target.n_atoms:
             continue
-        plan = planner.plan(before, TARGET)
-        report = check_plan(plan, before, TARGET, setting.parallel, GRID, motion)
+        plan = planner.plan(before, target)
+        report = check_plan(plan, before, target, setting.parallel, grid, motion)
         start_s = now_s + 1.0 + motion.overhead_per_cycle_s
-        simulation.play("mobile_tweezers", tone_program(plan, grid=GRID, motion=motion), start_s)
+        simulation.play("mobile_tweezers", tone_program(plan, grid=grid, motion=motion), start_s)
         simulation.expose(now_s + 1.0 + report.duration_s, EXPOSURE_S)
         after = simulation.truth()
-        predicted = predict_survival(plan, report, before, TARGET, GRID, motion, EXPOSURE_S)
+        predicted = predict_survival(plan, report, before, target, grid, motion, EXPOSURE_S)
         found.append(
             (
                 float(before.sum() - after.sum()),
                 predicted.n_lost,
-                float(after[TARGET.fill].all()),
+                float(after[target.fill].all()),
                 predicted.p_defect_free,
             )
         )

@@ -132,11 +132,11 @@ class LossSpec:
     passing: Annotated[
         Loss,
         Field(
-            description="loss of an atom that a tweezer passes at 1.944 um, as in a straight lane of the "
-            "paper's lattice; a factor e less for each further 0.15 um; the tweezer's own atom is then lost "
-            "too"
+            description="loss of an atom that a tweezer of full depth passes at 1.944 um, as in a straight "
+            "lane of the paper's lattice; a factor e less for each further 0.1 um, and less in shallower "
+            "tweezers, see `path_depth`; the tweezer's own atom is then lost too"
         ),
-    ] = 0.0027
+    ] = 0.0044
     spread: Annotated[
         float,
         Field(

@@ -90,7 +90,7 @@ def predict_survival(
         0.9
     """
     losses = motion.losses
-    hazards, n_landings, n_passes = _hazards(plan, np.asarray(occupancy, np.bool_), grid, losses)
+    hazards, n_landings, n_passes = _hazards(plan, np.asarray(occupancy, np.bool_), grid, motion)
     duration_s = report.duration_s + wait_s
     standing = duration_s / losses.lifetime_s - math.log1p(-losses.image)
     factors, weights = _factors(losses.spread)
@@ -165,8 +165,11 @@ MOVED, LANDED, PASSED = range(3)
 """Causes of the hazards."""
 
 
-def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, losses: LossSpec) -> tuple[Floats, int, int]:
+def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, motion: MotionSpec) -> tuple[Floats, int, int]:
     """Hazards of the atom that ends on each site, float64 (3, n_rows, n_cols); landings and passes."""
+    losses = motion.losses
+    # A shallower tweezer lowers the barrier between the two wells less; the exponent is fitted to flights.
+    pass_hazard = -math.log1p(-losses.passing) * motion.path_depth**2.5
     hazards = np.zeros((3, *grid.shape))
     if not len(plan.path_shapes):
         from labseq.motion.survival_kernels import line_hazards
@@ -187,10 +190,10 @@ def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, losses: LossSpec) 
                 hazards[LANDED][at] -= math.log1p(-losses.landing)
                 n_landings += 1
             if losses.passing > 0:
-                hazard, tones = -math.log1p(-losses.passing), batch.tones.tones_of(batch.from_sites)
+                tones = batch.tones.tones_of(batch.from_sites)
                 of_site, of_tweezer, n = _passes(batch.tones, atoms, grid)
-                hazards[PASSED] += hazard * of_site
-                before[PASSED] += hazard * of_tweezer[tones[:, 0], tones[:, 1]]
+                hazards[PASSED] += pass_hazard * of_site
+                before[PASSED] += pass_hazard * of_tweezer[tones[:, 0], tones[:, 1]]
                 n_passes += n
         to_row, to_col = batch.to_sites.T
         stays = (to_row >= 0) & (to_row < grid.n_rows) & (to_col >= 0) & (to_col < grid.n_cols)
@@ -248,8 +251,9 @@ def _passes(paths: TonePaths, atoms: Occupancy, grid: SiteGrid) -> tuple[Floats,
     positions = np.concatenate([paths.row.ravel(), paths.column.ravel()])
     off = np.concatenate([paths.row_off, paths.column_off]).astype(np.int32)
     a1, a2 = grid.axes / grid.spacing_m
-    # The loss by passing is that of the profile at 1.944 um, as in a straight lane of the paper's lattice,
-    # and about 1/e of that 0.15 um further away: from the table of passes on the page of ``grid``.
-    distances = BESIDE, 1.944e-6 / grid.spacing_m, 0.15e-6 / grid.spacing_m
+    # The loss by passing is that of the profile at 1.944 um, as in a straight lane of the paper's lattice.
+    # From there to 2.4 um the barrier of a static tweezer of 300 uK beside one of 2.1 mK rises by 290 to
+    # 310 uK per um, and the loss falls by e for each 30 uK (fitted to flights of whole plans).
+    distances = BESIDE, 1.944e-6 / grid.spacing_m, 0.1e-6 / grid.spacing_m
     n = add_passes(positions, off, paths.shape, atoms, float(a1 @ a2), distances, of_site, of_tweezer)
     return of_site, of_tweezer, n
