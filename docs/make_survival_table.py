@@ -134,7 +134,8 @@ def table(n_shots: int) -> list[str]:
         cells = [setting.name]
         for simulated, predicted in measure(setting, n_shots).values():
             cells += [str(simulated), f"{predicted.value:.3g}"]
-            deviations.append((simulated.value - predicted.value) / simulated.error)
+            if simulated.error > 0:  # not where no shot of all is whole
+                deviations.append((simulated.value - predicted.value) / simulated.error)
         sys.stderr.write(" | ".join(cells) + "\n")
         lines.append("| " + " | ".join(cells) + " |")
     spread = float(np.sqrt(np.mean(np.square(deviations))))

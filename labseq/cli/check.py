@@ -22,9 +22,10 @@ from labseq.console.output import say
 from labseq.console.report import Facts, aligned, reporting
 from labseq.console.text import age_text, clock_time, encodes, plural, settings_text
 from labseq.errors import Problem
-from labseq.messages import clean
+from labseq.messages import clean, visible
 from labseq.model import CalibrationEntry, TimelineEntry
 from labseq.model.policies import StepPolicy
+from labseq.session.advice import better_planner
 from labseq.session.check import CheckReport, check
 from labseq.session.rehearsal import Rehearsal
 from labseq.session.session import Session
@@ -184,10 +185,10 @@ class CheckedSequence:
     problems: Sequence[Problem] = ()
 
     @classmethod
-    def of(cls, assembly: Assembly, checked: CheckReport) -> CheckedSequence:
+    def of(cls, assembly: Assembly, checked: CheckReport, better: str = "") -> CheckedSequence:
         """What the check of a sequence found."""
         return cls(
-            about=_subject(assembly),
+            about=[*_subject(assembly, checked.planner_choice), *([("better", better)] if better else [])],
             timeline=[TimelineStep(i, name, bars) for i, (name, bars) in enumerate(checked.timeline)],
             shots=checked.n_shots,
             shot_s=(checked.shortest_shot_s, checked.longest_shot_s),
@@ -257,13 +258,13 @@ def check_sequence(
             sequence, profile=profile, overrides=overrides, dry_run=dry_run, observer=LogLines(sys.stderr)
         )
         checked = check(session)
-        show(CheckedSequence.of(session.assembly, checked))
+        show(CheckedSequence.of(session.assembly, checked, better_planner(session)))
     if not as_json:
         for warning in checked.warnings:
             say(*warning_lines(warning), stream=sys.stderr)
 
 
-def _subject(assembly: Assembly) -> Facts:
+def _subject(assembly: Assembly, planner_choice: Sequence[str]) -> Facts:
     target, spec = assembly.target, assembly.sequence
     grid, document = assembly.hardware.grid, assembly.hardware.document
     listed = settings_text({k: v for k, v in assembly.planner.dump().items() if k != "use"})
@@ -280,6 +281,7 @@ def _subject(assembly: Assembly) -> Facts:
         *([] if target.is_none else [("target", f"{target.name}, {sites}")]),
         ("planner", assembly.planner.entry.name + (f" ({listed})" if listed else "")),
         *([("algorithm", clean(algorithm))] if algorithm else []),
+        *(("or" if n else "chosen", visible(text)) for n, text in enumerate(planner_choice)),
         *(("calibration", _calibration(entry)) for entry in assembly.hardware.calibrations.values()),
         *(("scan", text) for text in _scanned(assembly)),
         *(("measures", _measure(one)) for one in assembly.resolved["measure"]),

@@ -23,6 +23,7 @@ LASTING: Final = frozenset(
         "left_on",
         "compiling",
         "compiled",
+        "planner_chosen",
         "warning",
         "ended_early",
         "run_starting",
@@ -133,6 +134,8 @@ def event_text(  # noqa: C901 - a case for each event
             return compiling_text(values["about_s"])
         case "compiled":
             return f"compiled in {format_quantity(values['duration_s'], 'time')}"
+        case "planner_chosen":
+            return f"planner: {values['chosen'][0]}"
         case "warning":
             return f"warning: {values['text']}"
         case "left_on":

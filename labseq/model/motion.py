@@ -133,7 +133,7 @@ class LossSpec:
         Loss,
         Field(
             description="loss of an atom that a tweezer of full depth passes at 1.944 um, as in a straight "
-            "lane of the paper's lattice; a factor e less for each further 0.1 um, and less in shallower "
+            "lane of the paper's lattice; a factor e less for each further 0.12 um, and less in shallower "
             "tweezers, see `path_depth`; the tweezer's own atom is then lost too"
         ),
     ] = 0.0044

@@ -36,6 +36,7 @@ class Survival:
 
     Attributes:
         p_defect_free: Probability that every target site holds an atom on the next image.
+        n_defects: Expected number of target sites without an atom on it.
         n_lost: Expected number of atoms lost until then, over the whole grid.
         n_lost_moved: Those of them lost by moves.
         n_lost_landing: Those lost because an empty tweezer was ramped down on them.
@@ -45,6 +46,7 @@ class Survival:
     """
 
     p_defect_free: float
+    n_defects: float
     n_lost: float
     n_lost_moved: float
     n_lost_landing: float
@@ -100,10 +102,13 @@ def predict_survival(
     if np.count_nonzero(by_cause) > 1:
         lost_by_moves = _n_lost(total[report.predicted], factors, weights)
     n_atoms = np.count_nonzero(report.predicted)
+    filled = target.fill & report.predicted
+    kept = math.exp(-standing) * (np.count_nonzero(filled) - _n_lost(total[filled], factors, weights))
     chance = weights @ np.exp(-factors * total[target.fill].sum())
     chance *= math.exp(-standing * target.n_atoms)
     return Survival(
         float(chance) if report.n_defects == 0 else 0.0,
+        target.n_atoms - kept,
         -n_atoms * math.expm1(-standing) + math.exp(-standing) * lost_by_moves,
         *by_cause,
         n_landings=n_landings,
@@ -169,7 +174,7 @@ def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, motion: MotionSpec
     """Hazards of the atom that ends on each site, float64 (3, n_rows, n_cols); landings and passes."""
     losses = motion.losses
     # A shallower tweezer lowers the barrier between the two wells less; the exponent is fitted to flights.
-    pass_hazard = -math.log1p(-losses.passing) * motion.path_depth**2.5
+    pass_hazard = -math.log1p(-losses.passing) * motion.path_depth**2.2
     hazards = np.zeros((3, *grid.shape))
     if not len(plan.path_shapes):
         from labseq.motion.survival_kernels import line_hazards
@@ -253,7 +258,7 @@ def _passes(paths: TonePaths, atoms: Occupancy, grid: SiteGrid) -> tuple[Floats,
     a1, a2 = grid.axes / grid.spacing_m
     # The loss by passing is that of the profile at 1.944 um, as in a straight lane of the paper's lattice.
     # From there to 2.4 um the barrier of a static tweezer of 300 uK beside one of 2.1 mK rises by 290 to
-    # 310 uK per um, and the loss falls by e for each 30 uK (fitted to flights of whole plans).
-    distances = BESIDE, 1.944e-6 / grid.spacing_m, 0.1e-6 / grid.spacing_m
+    # 310 uK per um, and the loss falls by e for each 36 uK (fitted to flights of whole plans).
+    distances = BESIDE, 1.944e-6 / grid.spacing_m, 0.12e-6 / grid.spacing_m
     n = add_passes(positions, off, paths.shape, atoms, float(a1 @ a2), distances, of_site, of_tweezer)
     return of_site, of_tweezer, n

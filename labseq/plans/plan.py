@@ -56,7 +56,8 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
         from labseq.pictures.animations import check_animation
 
         check_animation(output.animate, source.occupancy.shape)
-    if source.occupancy.size <= 64 * 64:  # planning in plain Python is then faster than loading numba
+    # planning once in plain Python is faster than loading numba; `auto` plans a hundred times to choose
+    if source.occupancy.size <= 64 * 64 and request.planner != "auto":
         interpret()
     moves = plan_moves(request, source, announce=report_compiling, keep_refused=True)
     report = PlanReport.of(moves)

@@ -74,6 +74,7 @@ from labseq.registry import Registry
 from labseq.roles import (
     Analysis,
     Camera,
+    ChoosesPlanner,
     Clock,
     Context,
     Detector,
@@ -124,6 +125,7 @@ __all__ = [
     "CalibrationEntry",
     "Camera",
     "CameraFacts",
+    "ChoosesPlanner",
     "Clock",
     "ConfigError",
     "Context",

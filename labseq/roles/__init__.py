@@ -4,7 +4,7 @@ Roles are synchronous. A constructor does no I/O; ``open()`` does. Hardware role
 share ``open``, ``close``, ``safe_state`` (legal in any state, also before
 ``open``, and any number of times) and ``describe``. Optional abilities are methods
 of the role's base class that do nothing by default, so the core calls them without asking.
-The few Protocols that remain (``LeaderLink``, ``NeedsWarmUp``, ``ReportsSignals``,
+The few Protocols that remain (``ChoosesPlanner``, ``LeaderLink``, ``NeedsWarmUp``, ``ReportsSignals``,
 ``ReceivesOutput``) change what the core does where a plugin has them. :data:`ROLES` lists the roles;
 what a factory makes is checked against it once.
 
@@ -15,6 +15,7 @@ Failures: a device raises ``DeviceError`` (or ``DeviceTimeoutError``),
 
 from labseq.roles.deciding import (
     Analysis,
+    ChoosesPlanner,
     Detection,
     Detector,
     NeedsWarmUp,
@@ -55,6 +56,7 @@ __all__ = [
     "WHOLE_SENSOR",
     "Analysis",
     "Camera",
+    "ChoosesPlanner",
     "Clock",
     "Context",
     "Detection",

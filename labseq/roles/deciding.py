@@ -176,6 +176,19 @@ class NeedsWarmUp(Protocol):
 
 
 @runtime_checkable
+class ChoosesPlanner(Protocol):
+    """A planner that chooses how it plans for a target, before the first shot."""
+
+    def choose(self, target: TargetPattern) -> Sequence[str]:
+        """Choose, or recall what was chosen.
+
+        Returns:
+            What was chosen, then the alternatives, a line each, for ``labseq check`` and the log of the run.
+        """
+        ...
+
+
+@runtime_checkable
 class ReportsSignals(Protocol):
     """A detector that reports the signals it compares with its thresholds.
 

@@ -457,6 +457,7 @@ EVENTS: Final = {
     "compiling": "kernels are compiled, which happens once on each computer",
     "compiled": "they are, with the time it took",
     "settling": "labseq waits for a device to settle, such as a camera that cools down",
+    "planner_chosen": "what the planner has chosen for the target, and why",
     "run_started": "all devices are open",
     "state": "the state of the run has changed: opening, idle, shot, writing, recovering, ...",
     "shot_started": "an attempt at a shot begins",

@@ -154,6 +154,9 @@ COLUMNS: Final[Mapping[str, str]] = {
     "device call": "longest time that a call of a device may take",
     "not opened": "devices that the check has not opened",
     "algorithm": "which algorithm the settings of the planner choose, where its name does not say it",
+    "chosen": "what a planner that chooses has chosen for the target",
+    "better": "the planner `auto` is expected to leave clearly fewer defects than that of the sequence",
+    "or": "the next best of each planner, and those that cannot be chosen",
     "measures": "what the run measures, with the model of its fit",
 }
 """Heads of columns and names of rows -> their meaning."""

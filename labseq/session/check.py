@@ -26,7 +26,7 @@ from labseq.messages import visible
 from labseq.model import COMPUTER, Frame, LineSpec, Plan, TimelineEntry
 from labseq.model.lines import NO_PULSES, LineProgram, Pulses
 from labseq.motion import tone_program
-from labseq.roles import Detector, Step, find_leader
+from labseq.roles import ChoosesPlanner, Detector, Step, find_leader
 from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, trigger_line
@@ -318,6 +318,7 @@ class CheckReport:
         free_bytes: Free space on the disk of the data folder.
         line_specs: The lines of the timing box.
         idle_outputs: Name of each device that puts out something when nothing plays -> what.
+        planner_choice: What the planner has chosen for the target, then the alternatives.
     """
 
     timeline: Timeline
@@ -330,6 +331,7 @@ class CheckReport:
     free_bytes: int
     line_specs: Sequence[LineSpec] = ()
     idle_outputs: Mapping[str, str] = field(default_factory=dict[str, str])
+    planner_choice: Sequence[str] = ()
 
     @property
     def bars(self) -> list[TimelineEntry]:
@@ -411,7 +413,15 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         free,
         first.lab.line_specs,
         {name: text for name, device in first.lab.hardware() if (text := device.idle_output)},
+        _planner_choice(first),
     )
+
+
+def _planner_choice(first: _PointCheck) -> Sequence[str]:
+    planner, target = first.lab.planner, first.lab.target
+    if not isinstance(planner, ChoosesPlanner) or not first.windows or target.is_none:
+        return ()
+    return planner.choose(target)
 
 
 def _run_s(checks: _Checks) -> tuple[float, float]:

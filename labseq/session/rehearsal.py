@@ -14,11 +14,10 @@ from labseq.errors import LabseqError, Problem, StopRequested
 from labseq.guard import Guard
 from labseq.model import Plan, PlanReport
 from labseq.motion import check_plan, fitting_batches
+from labseq.motion.expectation import PAPERS_LOADING
 from labseq.roles import Step
 from labseq.sequencer.lab import Lab
 
-PAPERS_LOADING: Final = 0.75
-"""Loading probability if the profile has no simulation that reports it."""
 SURVIVAL: Final = 0.98
 """Share of the atoms that a cycle of a rehearsal leaves; 97.66 % of the target in the paper, after one."""
 N_PROGRAMS: Final = 5
@@ -56,6 +55,12 @@ class Rehearsal:
         return quantile(self.duration_s, share)
 
 
+def loading_of(lab: Lab) -> float:
+    """Fraction of the sites that hold an atom, as the simulation says, else as in the paper."""
+    simulated = None if lab.simulation is None else lab.simulation.loading_probability
+    return PAPERS_LOADING if simulated is None else simulated
+
+
 def quantile(values: NDArray[np.float64], share: float) -> float:
     """Quantile of at least one value; those of numpy would import ``numpy.ma``, which takes 40 ms."""
     ranks = np.arange(len(values))
@@ -76,9 +81,7 @@ def rehearse(
     Returns:
         The results of each rearrangement, some of the plans, and the planner's failure.
     """
-    loading = None if lab.simulation is None else lab.simulation.loading_probability
-    if loading is None:
-        loading = PAPERS_LOADING
+    loading = loading_of(lab)
     shots: list[list[FirstCycle]] = []
     cycles: list[FirstCycle] = []
 

@@ -25,7 +25,7 @@ from labseq.recording import clear_active, data_root, find_dead_run, mark_active
 from labseq.recording.folders import NOTIFY_FILE, SOURCES_FILE, later_day
 from labseq.recording.index import IndexRow
 from labseq.recording.writer import RunWriter
-from labseq.roles import RunObserver
+from labseq.roles import ChoosesPlanner, RunObserver
 from labseq.safety.locks import lock_devices
 from labseq.sequencer.clock import ClockJumps
 from labseq.sequencer.lab import Lab, describe
@@ -376,6 +376,8 @@ class Session(PreparedRun):
         watchdog = Watchdog(f"the run {writer.run_dir}", log, pulse, self._end_without_watchdog)
         shots = Shots(self, lab, first, writer, watchdog)
         settings, target = self.assembly.sequence.policy.checks, self.assembly.target
+        if isinstance(lab.planner, ChoosesPlanner) and not target.is_none:
+            self.observers.event("planner_chosen", {"chosen": [*lab.planner.choose(target)]})
         before = () if self.earlier is None else self.earlier.rows
         # in the reverse order of these lines: devices safe, results of analyses waited for, the mark removed
         with (

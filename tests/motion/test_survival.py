@@ -85,8 +85,8 @@ def test_atoms_beside_a_lane_may_be_taken_along_with_the_atom_that_passes(depth:
     motion = MotionSpec(losses=replace(NO_LOSS, passing=0.01), path_depth=depth)
     report = check_plan(plan, atoms, target, 1, grid, motion)
     predicted = predict_survival(plan, report, atoms, target, grid, motion)
-    wider = math.exp((1.944 - grid.spacing_m * 1e6 / 2) / 0.1)  # than the paper's lane
-    kept = 0.99 ** (wider * depth**2.5)
+    wider = math.exp((1.944 - grid.spacing_m * 1e6 / 2) / 0.12)  # than the paper's lane
+    kept = 0.99 ** (wider * depth**2.2)
     assert predicted.n_passes == 2
     assert predicted.n_lost == pytest.approx(2 * (1 - kept) + 1 - kept**2, rel=1e-4)  # and of old age
     assert predicted.n_lost_passing == pytest.approx(predicted.n_lost, rel=1e-4)

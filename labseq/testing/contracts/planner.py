@@ -15,7 +15,7 @@ from labseq.errors import InvalidPlanError, LabseqError
 from labseq.kernels.kernel import load_kernels
 from labseq.model import Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import RULES, check_plan
-from labseq.roles import Context, NeedsWarmUp, Planner
+from labseq.roles import ChoosesPlanner, Context, NeedsWarmUp, Planner
 from labseq.testing.contracts.promises import (
     CallHungError,
     ContractViolation,
@@ -508,6 +508,8 @@ class PlannerContract:
         if isinstance(planner, NeedsWarmUp):
             planner.warm()
             load_kernels()
+        if isinstance(planner, ChoosesPlanner):
+            planner.choose(target)
         return planner
 
     def on_examples(self, check: Check, *, served: bool = False) -> None:

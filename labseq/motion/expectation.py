@@ -1,0 +1,72 @@
+"""What a planner is expected to give: means of the predicted survival over random loadings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
+from labseq.motion.check import check_plan
+from labseq.motion.survival import predict_survival
+
+PAPERS_LOADING: Final = 0.75
+"""Fraction of the sites that hold an atom where nothing says it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Means over loadings, on the image after the first cycle.
+
+    Attributes:
+        n_atoms: Number of target sites.
+        n_defects: Number of them without an atom.
+        p_defect_free: Probability that all hold one.
+    """
+
+    n_atoms: int
+    n_defects: float
+    p_defect_free: float
+
+    def __str__(self) -> str:
+        filling = 100 * (1 - self.n_defects / max(1, self.n_atoms))
+        return f"filling {filling:.2f} %, defect-free {100 * self.p_defect_free:.2g} %"
+
+
+def random_loadings(shape: tuple[int, int], loading: float, n: int) -> NDArray[np.bool_]:
+    """Random loadings, the same at each call: bool (n, n_rows, n_cols)."""
+    return np.random.default_rng(0).random((n, *shape)) < loading
+
+
+def expect(
+    plan_for: Callable[[Occupancy, TargetPattern], Plan],
+    loadings: Iterable[Occupancy],
+    target: TargetPattern,
+    degree_of_parallelism: int,
+    grid: SiteGrid,
+    motion: MotionSpec,
+) -> Expected:
+    """Plan for loadings, and predict what is left after the first cycle; losses are those of the profile.
+
+    Args:
+        plan_for: The method ``plan`` of a planner.
+        loadings: bool (n_rows, n_cols) each, at least one.
+        target: The target.
+        degree_of_parallelism: Maximum number of tweezers on at once.
+        grid: The grid of sites.
+        motion: How the tweezers move, with the losses.
+
+    Raises:
+        InvalidPlanError: A plan breaks a rule of the check.
+    """
+    found: list[tuple[float, float]] = []
+    for atoms in loadings:
+        plan = plan_for(atoms, target)
+        report = check_plan(plan, atoms, target, degree_of_parallelism, grid, motion)
+        of_plan = predict_survival(plan, report, atoms, target, grid, motion)
+        found.append((of_plan.n_defects, of_plan.p_defect_free))
+    n_defects, p_defect_free = np.mean(found, axis=0).tolist()
+    return Expected(target.n_atoms, n_defects, p_defect_free)

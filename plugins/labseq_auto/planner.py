@@ -1,0 +1,148 @@
+"""The planner ``auto``: it compares other planners on random loadings of the target, and uses the best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from labseq.plugin import (
+    Context,
+    Fraction,
+    LimitError,
+    Plan,
+    PlanError,
+    Planner,
+    Registry,
+    Settings,
+    TargetPattern,
+    as_occupancy,
+)
+from labseq.plugin.planning import PAPERS_LOADING, Expected, expect, random_loadings
+
+
+class AutoSettings(Settings):
+    """Settings of the planner ``auto``."""
+
+    loading: Fraction | None = Field(
+        default=None,
+        gt=0,
+        description="fraction of the sites that hold an atom in the loadings that planners are compared on; "
+        "left out: that of the simulation, else 75 %",
+    )
+
+
+TWEEZERS: Final = (2, 4, 7, 10, 15, 20, 40)
+"""Numbers of tweezers that are compared, those of the figures of the paper among them."""
+PLANNERS: Final[dict[str, dict[str, Any]]] = {"psca": {}, "grid": {"lanes": "weaving"}}
+"""Planners that are compared, with their settings: those that lose fewest atoms of all that labseq has."""
+SITES: Final = 5000
+"""About how many sites the loadings have in all: 12 of 20 x 20."""
+LOADINGS: Final = (3, 12)
+"""Least and greatest number of loadings."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A planner with its settings.
+
+    Attributes:
+        name: For messages.
+        planner: The planner.
+        tweezers: Most tweezers on at once.
+    """
+
+    name: str
+    planner: Planner
+    tweezers: int
+
+
+class AutoPlanner:
+    """Plans as the planner does that is expected to leave the fewest defects of a target.
+
+    Which one that is depends on grid, lattice, target, light and losses. It is worked out by
+    :func:`labseq.plugin.planning.expect` on loadings that are always the same, when a target first comes.
+
+    Args:
+        settings: The planner's settings.
+        context: Its grid, motion and losses decide.
+        registry: Has the other planners.
+
+    Attributes:
+        degree_of_parallelism: Most tweezers on at once of any candidate.
+    """
+
+    def __init__(self, settings: AutoSettings, context: Context, registry: Registry) -> None:
+        self._context = context
+        simulated = None if context.simulation is None else context.simulation.loading_probability
+        self._loading = settings.loading or simulated or PAPERS_LOADING
+        self._why_not: list[str] = []
+        self._candidates = self._all(registry)
+        self.degree_of_parallelism = max(candidate.tweezers for candidate in self._candidates)
+        self._key: tuple[bytes, bytes] | None = None
+        self._chosen, self._why = self._candidates[0], list[str]()
+
+    def _all(self, registry: Registry) -> list[Candidate]:
+        """The planners that this machine allows; psca, which needs no lanes, is always among them."""
+        most, found = self._context.motion.max_tweezers, list[Candidate]()
+        for name, settings in PLANNERS.items():
+            entry = registry.get("planner", name)
+            model: Any = entry.settings_model
+            try:
+                for n in sorted({min(n, most) for n in TWEEZERS}):
+                    values = model.model_validate({**settings, "degree_of_parallelism": n})
+                    words = f"{name} with {n} tweezer{'s' * (n > 1)}"
+                    found.append(Candidate(words, entry.factory(values, self._context), n))
+            except LimitError as error:
+                self._why_not.append(f"{name} is left out: {error}")
+        return found
+
+    def warm(self) -> None:
+        """Compile the kernels, or load them from the cache."""
+        for candidate in self._candidates:
+            getattr(candidate.planner, "warm", lambda: None)()
+
+    def choose(self, target: TargetPattern) -> Sequence[str]:
+        """Choose the planner of a target, if that is not done.
+
+        Args:
+            target: The target.
+
+        Returns:
+            The choice, the next best of each planner, and why others cannot be chosen.
+        """
+        if (key := (target.fill.tobytes(), target.clear.tobytes())) != self._key:
+            fewest, most = LOADINGS
+            n_loadings = min(max(fewest, SITES // target.fill.size), most)
+            loadings = random_loadings(target.shape, self._loading, n_loadings)
+            results = [(self._expect(one, loadings, target), one) for one in self._candidates]
+            results.sort(key=lambda result: result[0].n_defects)
+            self._chosen = results[0][1]
+            texts = [f"{candidate.name}: {expected}" for expected, candidate in results]
+            next_best = (next((text for text in texts[1:] if text.startswith(name)), "") for name in PLANNERS)
+            self._key, self._why = key, [texts[0], *filter(None, next_best), *self._why_not]
+        return self._why
+
+    def _expect(self, candidate: Candidate, loadings: Any, target: TargetPattern) -> Expected:
+        grid, motion = self._context.grid, self._context.motion
+        return expect(candidate.planner.plan, loadings, target, candidate.tweezers, grid, motion)
+
+    def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
+        """Plan as the planner does that was chosen for the target.
+
+        Args:
+            occupancy: bool (n_rows, n_cols), as detected.
+            target: The wanted pattern, of the same shape.
+
+        Raises:
+            PlanError: The occupancy is not an array of zeros and ones in the target's shape.
+        """
+        try:
+            occupied = as_occupancy(occupancy, target.shape)
+        except (TypeError, ValueError) as error:
+            raise PlanError(str(error), "auto") from error
+        self.choose(target)
+        return self._chosen.planner.plan(occupied, target)

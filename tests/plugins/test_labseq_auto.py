@@ -1,0 +1,140 @@
+"""The planner `auto`: the choice is the best of those that the machine allows, and is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import labseq_auto
+import labseq_grid
+import labseq_psca
+import numpy as np
+import pytest
+from labseq_auto.planner import PLANNERS, TWEEZERS, AutoPlanner, AutoSettings
+
+from labseq import make_planner
+from labseq.cli import main
+from labseq.data.reader import open_run
+from labseq.errors import PlanError
+from labseq.model import LossSpec, MotionSpec
+from labseq.plugin import Context, Registry, SiteGrid, TargetPattern
+from labseq.plugin.planning import check_plan, expect, random_loadings
+
+from .planning import COMPACT
+
+GRID = SiteGrid()
+
+
+def registry() -> Registry:
+    made = Registry()
+    for plugin in (labseq_psca, labseq_grid, labseq_auto):
+        plugin.labseq_register(made)
+    return made
+
+
+def auto(motion: MotionSpec, loading: float | None = None) -> AutoPlanner:
+    return AutoPlanner(AutoSettings(loading=loading), Context(grid=GRID, motion=motion), registry())
+
+
+@pytest.mark.parametrize("losses", [LossSpec(), LossSpec(passing=0.3), LossSpec(move=0.1)])
+def test_the_choice_leaves_fewest_defects_of_all(losses: LossSpec) -> None:
+    motion = MotionSpec(losses=losses, max_tweezers=10)
+    chosen = auto(motion)
+    said = chosen.choose(COMPACT)
+    loadings = random_loadings(GRID.shape, 0.75, 12)
+    expected = {
+        f"{name} with {n} tweezers": expect(
+            make_planner(name, grid=GRID, motion=motion, degree_of_parallelism=n, **options).plan,
+            loadings, COMPACT, n, GRID, motion,
+        )
+        for name, options in PLANNERS.items()
+        for n in sorted({min(n, 10) for n in TWEEZERS})
+    }  # fmt: skip
+    best = min(expected, key=lambda name: expected[name].n_defects)
+    assert said[0] == f"{best}: {expected[best]}"
+    plan = chosen.plan(loadings[0], COMPACT)
+    name, n = best.split()[0], int(best.split()[2])
+    other = make_planner(name, grid=GRID, motion=motion, degree_of_parallelism=n, **PLANNERS[name])
+    assert np.array_equal(plan.moves, other.plan(loadings[0], COMPACT).moves)
+
+
+def test_passes_that_cost_much_and_lanes_that_are_missing_lead_to_psca() -> None:
+    assert auto(MotionSpec()).choose(COMPACT)[0].startswith("grid with")
+    assert auto(MotionSpec(losses=LossSpec(passing=0.3))).choose(COMPACT)[0].startswith("psca with")
+    said = auto(MotionSpec(clearance_m=3e-6)).choose(COMPACT)
+    assert said[0].startswith("psca with")
+    assert said[-1].startswith("grid is left out: the clearance of moving tweezers")
+
+
+def test_one_tweezer_and_few_atoms() -> None:
+    planner = auto(MotionSpec(max_tweezers=1), loading=0.3)
+    assert "with 1 tweezer:" in planner.choose(COMPACT)[0]
+    atoms = random_loadings(GRID.shape, 0.3, 1)[0]
+    plan = planner.plan(atoms, COMPACT)
+    report = check_plan(plan, atoms, COMPACT, 1, GRID, MotionSpec(max_tweezers=1))
+    assert report.n_defects == COMPACT.n_atoms - int(atoms.sum())
+
+
+def test_another_target_is_another_choice() -> None:
+    planner = auto(MotionSpec())
+    first = planner.choose(COMPACT)
+    fill = np.zeros(GRID.shape, np.bool_)
+    fill[9, 9] = True
+    small = TargetPattern(fill, fill & False)
+    assert planner.choose(small) != first
+    assert planner.choose(COMPACT) == first
+    with pytest.raises(PlanError, match="auto"):
+        planner.plan(np.zeros((3, 3)), small)
+
+
+def run_main(*arguments: str) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 0
+
+
+SEQUENCE = """
+labseq: 1
+name: chosen
+profile: virtual
+shots: 1
+target: {{pattern: compact, rows: 15, cols: 15}}
+planner: {planner}
+shot:
+  - load: {{duration: 500 ms}}
+  - image: {{exposure: 45 ms}}
+  - rearrange: {{cycles: 1, window: 60 ms}}
+  - image: {{exposure: 45 ms}}
+"""
+
+
+def test_check_and_record_say_what_was_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = tmp_path / "chosen.yaml"
+    sequence.write_text(SEQUENCE.format(planner="{use: auto}"))
+    run_main("check", str(sequence))
+    out = capsys.readouterr().out
+    assert "chosen    grid with" in out
+    assert "or        psca with" in out
+    assert "better" not in out
+    run_main("run", str(sequence), f"--output={tmp_path}", "--json")
+    assert "planner: grid with" in capsys.readouterr().err
+    run = open_run(next(tmp_path.glob("*/*/run.json")))
+    (event,) = (event for event in run.events if event["event"] == "planner_chosen")
+    assert event["values"]["chosen"][0].startswith("grid with")
+    assert {"psca", "grid", "auto"} <= {
+        plugin["name"].removeprefix("labseq_") for plugin in run.record["plugins"]
+    }
+
+
+def test_check_names_a_choice_that_is_clearly_better(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence = tmp_path / "chosen.yaml"
+    for planner, is_named in (
+        ("{use: psca, degree_of_parallelism: 7}", True),
+        ("{use: grid, degree_of_parallelism: 7, lanes: weaving}", False),
+    ):
+        sequence.write_text(SEQUENCE.format(planner=planner))
+        run_main("check", str(sequence))
+        out = capsys.readouterr().out
+        assert ("better     `auto`: " in out) == is_named
+        assert (" defects after one cycle, filling 98." in out) == is_named
