@@ -23,7 +23,7 @@ from labseq.console.report import Facts, aligned, reporting
 from labseq.console.text import age_text, clock_time, encodes, plural, settings_text
 from labseq.errors import Problem
 from labseq.messages import clean, visible
-from labseq.model import CalibrationEntry, TimelineEntry
+from labseq.model import CalibrationEntry, LossSpec, TimelineEntry
 from labseq.model.policies import StepPolicy
 from labseq.session.advice import better_planner
 from labseq.session.check import CheckReport, check
@@ -188,7 +188,7 @@ class CheckedSequence:
     def of(cls, assembly: Assembly, checked: CheckReport, better: str = "") -> CheckedSequence:
         """What the check of a sequence found."""
         return cls(
-            about=[*_subject(assembly, checked.planner_choice), *([("better", better)] if better else [])],
+            about=[*_subject(assembly, checked.planner_choice), *_expected(assembly, checked, better)],
             timeline=[TimelineStep(i, name, bars) for i, (name, bars) in enumerate(checked.timeline)],
             shots=checked.n_shots,
             shot_s=(checked.shortest_shot_s, checked.longest_shot_s),
@@ -286,6 +286,20 @@ def _subject(assembly: Assembly, planner_choice: Sequence[str]) -> Facts:
         *(("scan", text) for text in _scanned(assembly)),
         *(("measures", _measure(one)) for one in assembly.resolved["measure"]),
     ]
+
+
+def _expected(assembly: Assembly, checked: CheckReport, better: str) -> Facts:
+    """A planner that is expected to do better; and what of the expectations is not known of this machine."""
+    if not better and not checked.planner_choice:
+        return []
+    given = assembly.hardware.document.get(("mobile_tweezers", "losses")) or {}
+    guessed = [
+        name.removesuffix("_s")
+        for name in LossSpec.__dataclass_fields__
+        if name.removesuffix("_s") not in given
+    ]
+    losses = f"{', '.join(guessed)}: the paper's, as the profile does not give them"
+    return [*([("better", better)] if better else []), *([("losses", losses)] if guessed else [])]
 
 
 def _measure(measure: Mapping[str, Any]) -> str:

@@ -155,6 +155,7 @@ COLUMNS: Final[Mapping[str, str]] = {
     "not opened": "devices that the check has not opened",
     "algorithm": "which algorithm the settings of the planner choose, where its name does not say it",
     "chosen": "what a planner that chooses has chosen for the target",
+    "losses": "losses by which planners are compared, and which the profile does not give",
     "better": "the planner `auto` is expected to leave clearly fewer defects than that of the sequence",
     "or": "the next best of each planner, and those that cannot be chosen",
     "measures": "what the run measures, with the model of its fit",

@@ -114,6 +114,7 @@ def test_check_and_record_say_what_was_chosen(tmp_path: Path, capsys: pytest.Cap
     out = capsys.readouterr().out
     assert "chosen    grid with" in out
     assert "or        psca with" in out
+    assert "losses    move, tone," in out  # the profile has none of its own
     assert "better" not in out
     run_main("run", str(sequence), f"--output={tmp_path}", "--json")
     assert "planner: grid with" in capsys.readouterr().err
