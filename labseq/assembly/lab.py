@@ -16,7 +16,7 @@ from labseq.guard import Guard, StopFlag
 from labseq.kernels.kernel import announcing, load_kernels
 from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins.calls import call_plugin
-from labseq.roles import ChoosesPlanner, Clock, Context, NeedsWarmUp, Planner, RunObserver, Simulation
+from labseq.roles import Clock, Context, NeedsWarmUp, Planner, RunObserver, Simulation
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Lab
 
@@ -218,8 +218,6 @@ WARM_S: Final = 300.0
 def warm(lab: Lab, stop_flag: StopFlag, observer: RunObserver, *, devices: bool = True) -> None:
     """Compile all kernels before the first shot, because compiling during a shot would lose the atoms.
 
-    A planner that chooses how it plans for the target does so here, too.
-
     Args:
         lab: The lab whose objects need kernels.
         stop_flag: Checked all the time.
@@ -242,8 +240,6 @@ def warm(lab: Lab, stop_flag: StopFlag, observer: RunObserver, *, devices: bool 
         motion.warm()
         _warm_plugins(lab, stop_flag, devices)
         load_kernels(stop_flag.check)
-    if isinstance(lab.planner, ChoosesPlanner) and not lab.target.is_none:
-        Guard(stop_flag).call("planner", WARM_S, lab.planner.choose, lab.target)
     if started_s:
         observer.event("compiled", {"duration_s": time.monotonic() - started_s[0]})
 

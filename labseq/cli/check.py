@@ -268,7 +268,8 @@ def _subject(assembly: Assembly, planner_choice: Sequence[str]) -> Facts:
     target, spec = assembly.target, assembly.sequence
     grid, document = assembly.hardware.grid, assembly.hardware.document
     listed = settings_text({k: v for k, v in assembly.planner.dump().items() if k != "use"})
-    algorithm = assembly.planner.settings.algorithm_text() if assembly.planner.settings else ""
+    settings = None if target.is_none else assembly.planner.settings
+    algorithm = "" if settings is None else settings.algorithm_text()
     sites = f"{plural(target.n_atoms, 'atom')}, {plural(int(target.clear.sum()), 'site')} to be empty"
     simulated = ", dry run" if assembly.hardware.dry_run != "off" else ", simulated" * assembly.virtual_time
     return [

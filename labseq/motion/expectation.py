@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
 from labseq.motion.check import check_plan
 from labseq.motion.survival import predict_survival
+from labseq.motion.tones import fitting_batches
 
 PAPERS_LOADING: Final = 0.75
 """Fraction of the sites that hold an atom where nothing says it."""
@@ -32,8 +34,9 @@ class Expected:
     p_defect_free: float
 
     def __str__(self) -> str:
-        filling = 100 * (1 - self.n_defects / max(1, self.n_atoms))
-        return f"filling {filling:.2f} %, defect-free {100 * self.p_defect_free:.2g} %"
+        filling, defect_free = 1 - self.n_defects / max(1, self.n_atoms), f"{self.p_defect_free:.2g}"
+        percent = "below 0.01" if self.p_defect_free < 1e-4 else f"{100 * float(defect_free):g}"
+        return f"filling {100 * filling:.2f} %, defect-free {percent} %"
 
 
 def random_loadings(shape: tuple[int, int], loading: float, n: int) -> NDArray[np.bool_]:
@@ -48,6 +51,7 @@ def expect(
     degree_of_parallelism: int,
     grid: SiteGrid,
     motion: MotionSpec,
+    window_s: float = math.inf,
 ) -> Expected:
     """Plan for loadings, and predict what is left after the first cycle; losses are those of the profile.
 
@@ -58,6 +62,7 @@ def expect(
         degree_of_parallelism: Maximum number of tweezers on at once.
         grid: The grid of sites.
         motion: How the tweezers move, with the losses.
+        window_s: Time from the start of the cycle; batches that end later are not played.
 
     Raises:
         InvalidPlanError: A plan breaks a rule of the check.
@@ -66,6 +71,9 @@ def expect(
     for atoms in loadings:
         plan = plan_for(atoms, target)
         report = check_plan(plan, atoms, target, degree_of_parallelism, grid, motion)
+        if (n_fit := fitting_batches(report, plan, window_s)) < plan.n_batches:
+            plan = plan.first(n_fit)
+            report = check_plan(plan, atoms, target, degree_of_parallelism, grid, motion)
         of_plan = predict_survival(plan, report, atoms, target, grid, motion)
         found.append((of_plan.n_defects, of_plan.p_defect_free))
     n_defects, p_defect_free = np.mean(found, axis=0).tolist()

@@ -179,8 +179,12 @@ class NeedsWarmUp(Protocol):
 class ChoosesPlanner(Protocol):
     """A planner that chooses how it plans for a target, before the first shot."""
 
-    def choose(self, target: TargetPattern) -> Sequence[str]:
+    def choose(self, target: TargetPattern, window_s: float) -> Sequence[str]:
         """Choose, or recall what was chosen.
+
+        Args:
+            target: The target.
+            window_s: Time from the start of the first cycle in which its batches must end.
 
         Returns:
             What was chosen, then the alternatives, a line each, for ``labseq check`` and the log of the run.

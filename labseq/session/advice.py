@@ -6,10 +6,11 @@ from typing import Final
 
 from labseq.assembly.lab import WARM_S, construct_planner
 from labseq.assembly.plugin_choice import ChosenPlugin
+from labseq.errors import LabseqError, StopRequested
 from labseq.guard import Guard
 from labseq.kernels.kernel import load_kernels
 from labseq.motion.expectation import Expected, expect, random_loadings
-from labseq.roles import NeedsWarmUp
+from labseq.roles import ChoosesPlanner, NeedsWarmUp
 from labseq.sequencer.lab import Lab
 from labseq.session.prepared import PreparedRun
 from labseq.session.rehearsal import loading_of, windows_of
@@ -30,27 +31,38 @@ def better_planner(run: PreparedRun) -> str:
     entry = assembly.hardware.host.registry.find("planner", "auto")
     if entry is None or entry.settings_model is None or assembly.sequence.planner.use == "auto":
         return ""
-    if assembly.target.is_none or not windows_of(assembly.steps):
+    windows = windows_of(assembly.steps)
+    # the points of a scan are compared by taking it
+    if assembly.target.is_none or not windows or assembly.scanned is not None or assembly.search is not None:
         return ""
     chosen = ChosenPlugin(entry, entry.settings_model())
     guard = Guard(run.stop_flag)
     try:
         run.warm(lab := run.build_lab(), devices=False)
-        now, then = guard.call("planner", WARM_S, _compare, lab, chosen)
+        window_s = next(iter(windows.values()))[0]
+        now, then, choice = guard.call("planner", WARM_S, _compare, lab, chosen, window_s)
+    except StopRequested:
+        raise
+    except LabseqError:  # the check itself says what it finds wrong with a planner
+        return ""
     finally:
         guard.end()
     if then.n_defects > min(CLEARLY * now.n_defects, now.n_defects - 0.5):
         return ""
-    return f"`auto`: {then.n_defects:.1f} defects after one cycle, {then}; here {now.n_defects:.1f}, {now}"
+    there, here = f"{then.n_defects:.1f} defects after one cycle", f"{now.n_defects:.1f}, {now}"
+    return f"`auto`, which is {choice}: {there}, {then}; here {here}"
 
 
-def _compare(lab: Lab, auto: ChosenPlugin) -> tuple[Expected, Expected]:
-    """What the lab's planner and `auto` are expected to leave."""
+def _compare(lab: Lab, auto: ChosenPlugin, window_s: float) -> tuple[Expected, Expected, str]:
+    """What the lab's planner and `auto` are expected to leave, and which planner that is."""
     planner, most = construct_planner(auto, lab.grid, lab.motion)
     if isinstance(planner, NeedsWarmUp):
         planner.warm()
         load_kernels()
+    choice = planner.choose(lab.target, window_s)[0] if isinstance(planner, ChoosesPlanner) else ""
     loadings = random_loadings(lab.target.shape, loading_of(lab), N_LOADINGS)
     limits = (lab.planner, lab.degree_of_parallelism), (planner, most)
-    now, then = (expect(one.plan, loadings, lab.target, n, lab.grid, lab.motion) for one, n in limits)
-    return now, then
+    now, then = (
+        expect(one.plan, loadings, lab.target, n, lab.grid, lab.motion, window_s) for one, n in limits
+    )
+    return now, then, choice.partition(":")[0]

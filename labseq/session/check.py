@@ -26,7 +26,7 @@ from labseq.messages import visible
 from labseq.model import COMPUTER, Frame, LineSpec, Plan, TimelineEntry
 from labseq.model.lines import NO_PULSES, LineProgram, Pulses
 from labseq.motion import tone_program
-from labseq.roles import ChoosesPlanner, Detector, Step, find_leader
+from labseq.roles import Detector, Step, find_leader
 from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, trigger_line
@@ -413,15 +413,8 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         free,
         first.lab.line_specs,
         {name: text for name, device in first.lab.hardware() if (text := device.idle_output)},
-        _planner_choice(first),
+        run.choose(first.lab, first.point.steps),
     )
-
-
-def _planner_choice(first: _PointCheck) -> Sequence[str]:
-    planner, target = first.lab.planner, first.lab.target
-    if not isinstance(planner, ChoosesPlanner) or not first.windows or target.is_none:
-        return ()
-    return planner.choose(target)
 
 
 def _run_s(checks: _Checks) -> tuple[float, float]:
@@ -474,6 +467,7 @@ def _rehearse_all(checks: _Checks, points: Iterable[_PointCheck], runs: bool) ->
         is_new = id(point_check.lab) not in asked
         if is_new:
             run.warm(point_check.lab, devices=runs and n == 0)
+            run.choose(point_check.lab, point_check.point.steps)
         deadline = time.monotonic() + (wait_s if n else MAX_WAIT_S)
         n_loadings, windows = N_LOADINGS_ELSEWHERE if n else N_LOADINGS, [*point_check.windows.values()]
         rehearsals, plans, failure = rehearse(checks.guard, point_check.lab, windows, n_loadings, deadline)

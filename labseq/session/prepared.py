@@ -10,16 +10,17 @@ from pathlib import Path
 from typing import Protocol
 
 from labseq.assembly.assemble import Assembly
-from labseq.assembly.lab import build_lab, clock_for, warm
+from labseq.assembly.lab import WARM_S, build_lab, clock_for, warm
 from labseq.assembly.point import Point
 from labseq.data.reader import Run
 from labseq.data.shot import CachingLoader, Shot
-from labseq.guard import StopFlag
+from labseq.guard import Guard, StopFlag
 from labseq.recording.index import IndexRow
-from labseq.roles import RunObserver
+from labseq.roles import ChoosesPlanner, RunObserver, Step
 from labseq.sequencer.lab import Lab
 from labseq.session.checks import Analyses
 from labseq.session.observers import Observers
+from labseq.session.rehearsal import windows_of
 
 
 class History:
@@ -172,6 +173,26 @@ class PreparedRun:
     def warm(self, lab: Lab, *, devices: bool = True) -> None:
         """Compile the kernels of a lab; see :func:`labseq.assembly.lab.warm`."""
         warm(lab, self.stop_flag, self.observers, devices=devices)
+
+    def choose(self, lab: Lab, steps: Sequence[tuple[str, Step]]) -> Sequence[str]:
+        """Let a planner that chooses how it plans do so, which may take seconds.
+
+        Returns:
+            What it has chosen, then the alternatives; empty if it has no choice, or nothing is planned.
+        """
+        planner, windows = lab.planner, windows_of(steps)
+        if not isinstance(planner, ChoosesPlanner) or not windows or lab.target.is_none:
+            return ()
+        guard = Guard(self.stop_flag)
+        try:
+            return guard.call("planner", WARM_S, planner.choose, lab.target, next(iter(windows.values()))[0])
+        finally:
+            guard.end()
+
+    def choose_planner(self, lab: Lab, point: Point) -> None:
+        """Let a planner that chooses how it plans do so, and log it."""
+        if chosen := self.choose(lab, point.steps):
+            self.observers.event("planner_chosen", {"chosen": [*chosen]})
 
     def warn(self, text: str) -> None:
         """Report a warning."""

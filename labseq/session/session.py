@@ -25,7 +25,7 @@ from labseq.recording import clear_active, data_root, find_dead_run, mark_active
 from labseq.recording.folders import NOTIFY_FILE, SOURCES_FILE, later_day
 from labseq.recording.index import IndexRow
 from labseq.recording.writer import RunWriter
-from labseq.roles import ChoosesPlanner, RunObserver
+from labseq.roles import RunObserver
 from labseq.safety.locks import lock_devices
 from labseq.sequencer.clock import ClockJumps
 from labseq.sequencer.lab import Lab, describe
@@ -144,6 +144,8 @@ class Shots:
         if point is self._point:
             return
         lab, reopened = rebuild_lab(self.sequencer.lab, self._point, point, self._run.seed)
+        if lab.planner is not self.sequencer.lab.planner:
+            self._run.choose_planner(lab, point)  # not in the shot, whose atoms would wait
         self.sequencer.change(lab, point.steps, self._parameters(point), reopened)
         self._point = point
 
@@ -376,8 +378,7 @@ class Session(PreparedRun):
         watchdog = Watchdog(f"the run {writer.run_dir}", log, pulse, self._end_without_watchdog)
         shots = Shots(self, lab, first, writer, watchdog)
         settings, target = self.assembly.sequence.policy.checks, self.assembly.target
-        if isinstance(lab.planner, ChoosesPlanner) and not target.is_none:
-            self.observers.event("planner_chosen", {"chosen": [*lab.planner.choose(target)]})
+        self.choose_planner(lab, first)
         before = () if self.earlier is None else self.earlier.rows
         # in the reverse order of these lines: devices safe, results of analyses waited for, the mark removed
         with (

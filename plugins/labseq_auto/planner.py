@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -39,6 +40,8 @@ TWEEZERS: Final = (2, 4, 7, 10, 15, 20, 40)
 """Numbers of tweezers that are compared, those of the figures of the paper among them."""
 PLANNERS: Final[dict[str, dict[str, Any]]] = {"psca": {}, "grid": {"lanes": "weaving"}}
 """Planners that are compared, with their settings: those that lose fewest atoms of all that labseq has."""
+SHALLOWEST: Final = 0.8
+"""Least depth of tweezers on paths at which predicted losses hold, see docs/explanation/survival.md."""
 SITES: Final = 5000
 """About how many sites the loadings have in all: 12 of 20 x 20."""
 LOADINGS: Final = (3, 12)
@@ -78,11 +81,13 @@ class AutoPlanner:
     def __init__(self, settings: AutoSettings, context: Context, registry: Registry) -> None:
         self._context = context
         simulated = None if context.simulation is None else context.simulation.loading_probability
-        self._loading = settings.loading or simulated or PAPERS_LOADING
+        given = (loading for loading in (settings.loading, simulated) if loading is not None)
+        self._loading = next(given, PAPERS_LOADING)
         self._why_not: list[str] = []
         self._candidates = self._all(registry)
         self.degree_of_parallelism = max(candidate.tweezers for candidate in self._candidates)
-        self._key: tuple[bytes, bytes] | None = None
+        self._key: tuple[bytes, bytes, float] | None = None
+        self._window_s = math.inf
         self._chosen, self._why = self._candidates[0], list[str]()
 
     def _all(self, registry: Registry) -> list[Candidate]:
@@ -91,13 +96,18 @@ class AutoPlanner:
         for name, settings in PLANNERS.items():
             entry = registry.get("planner", name)
             model: Any = entry.settings_model
+            if settings and self._context.motion.path_depth < SHALLOWEST:
+                depth = f"at a path_depth below {SHALLOWEST:g} more atoms fall out than is predicted"
+                self._why_not.append(f"{name} is left out: {depth}")
+                continue
             try:
                 for n in sorted({min(n, most) for n in TWEEZERS}):
                     values = model.model_validate({**settings, "degree_of_parallelism": n})
                     words = f"{name} with {n} tweezer{'s' * (n > 1)}"
                     found.append(Candidate(words, entry.factory(values, self._context), n))
             except LimitError as error:
-                self._why_not.append(f"{name} is left out: {error}")
+                why = "; ".join(str(error).split("; ")[:2])  # the rest is for those who named the planner
+                self._why_not.append(f"{name} is left out: {why}")
         return found
 
     def warm(self) -> None:
@@ -105,30 +115,34 @@ class AutoPlanner:
         for candidate in self._candidates:
             getattr(candidate.planner, "warm", lambda: None)()
 
-    def choose(self, target: TargetPattern) -> Sequence[str]:
+    def choose(self, target: TargetPattern, window_s: float = math.inf) -> Sequence[str]:
         """Choose the planner of a target, if that is not done.
 
         Args:
             target: The target.
+            window_s: Time from the start of the first cycle in which its batches must end.
 
         Returns:
             The choice, the next best of each planner, and why others cannot be chosen.
         """
-        if (key := (target.fill.tobytes(), target.clear.tobytes())) != self._key:
+        if (key := (target.fill.tobytes(), target.clear.tobytes(), window_s)) != self._key:
             fewest, most = LOADINGS
             n_loadings = min(max(fewest, SITES // target.fill.size), most)
             loadings = random_loadings(target.shape, self._loading, n_loadings)
-            results = [(self._expect(one, loadings, target), one) for one in self._candidates]
+            results = [(self._expect(one, loadings, target, window_s), one) for one in self._candidates]
             results.sort(key=lambda result: result[0].n_defects)
             self._chosen = results[0][1]
             texts = [f"{candidate.name}: {expected}" for expected, candidate in results]
             next_best = (next((text for text in texts[1:] if text.startswith(name)), "") for name in PLANNERS)
-            self._key, self._why = key, [texts[0], *filter(None, next_best), *self._why_not]
+            self._why = [texts[0], *filter(None, next_best), *self._why_not]
+            self._key, self._window_s = key, window_s
         return self._why
 
-    def _expect(self, candidate: Candidate, loadings: Any, target: TargetPattern) -> Expected:
+    def _expect(
+        self, candidate: Candidate, loadings: Any, target: TargetPattern, window_s: float
+    ) -> Expected:
         grid, motion = self._context.grid, self._context.motion
-        return expect(candidate.planner.plan, loadings, target, candidate.tweezers, grid, motion)
+        return expect(candidate.planner.plan, loadings, target, candidate.tweezers, grid, motion, window_s)
 
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
         """Plan as the planner does that was chosen for the target.
@@ -144,5 +158,5 @@ class AutoPlanner:
             occupied = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), "auto") from error
-        self.choose(target)
+        self.choose(target, self._window_s)
         return self._chosen.planner.plan(occupied, target)

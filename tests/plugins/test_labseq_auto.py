@@ -65,6 +65,22 @@ def test_passes_that_cost_much_and_lanes_that_are_missing_lead_to_psca() -> None
     assert said[-1].startswith("grid is left out: the clearance of moving tweezers")
 
 
+def test_what_does_not_fit_into_the_window_does_not_count() -> None:
+    """Few tweezers leave fewest defects if there is time, and many if there is not."""
+    planner, window_s = auto(MotionSpec(overhead_per_batch_s=0.5e-3)), 24e-3
+    at_leisure, in_haste = planner.choose(COMPACT)[0], planner.choose(COMPACT, window_s)[0]
+    n_tweezers = [int(text.split()[2]) for text in (at_leisure, in_haste)]
+    assert n_tweezers[0] < n_tweezers[1]
+    loadings = random_loadings(GRID.shape, 0.75, 2)
+    assert planner.plan(loadings[0], COMPACT).n_batches < 13  # as was chosen last
+
+
+def test_shallow_tweezers_whose_losses_are_not_known_are_left_to_psca() -> None:
+    said = auto(MotionSpec(path_depth=0.5)).choose(COMPACT)
+    assert said[0].startswith("psca with")
+    assert said[-1].startswith("grid is left out: at a path_depth below 0.8")
+
+
 def test_one_tweezer_and_few_atoms() -> None:
     planner = auto(MotionSpec(max_tweezers=1), loading=0.3)
     assert "with 1 tweezer:" in planner.choose(COMPACT)[0]
@@ -126,6 +142,18 @@ def test_check_and_record_say_what_was_chosen(tmp_path: Path, capsys: pytest.Cap
     }
 
 
+def test_each_point_of_a_scan_has_its_choice_before_its_shot(tmp_path: Path) -> None:
+    sequence = tmp_path / "chosen.yaml"
+    scan = "scan:\n  profile.mobile_tweezers.path_depth: [1, 0.5]\n"
+    sequence.write_text(SEQUENCE.format(planner="{use: auto}").replace("shots: 1\n", scan))
+    run_main("run", str(sequence), f"--output={tmp_path}", "--json")
+    run = open_run(next(tmp_path.glob("*/*/run.json")))
+    events = [event for event in run.events if event["event"] in ("planner_chosen", "shot_started")]
+    assert [event["event"] for event in events] == ["planner_chosen", "shot_started"] * 2
+    chosen = [event["values"]["chosen"][0].split()[0] for event in events[::2]]
+    assert chosen == ["grid", "psca"]
+
+
 def test_check_names_a_choice_that_is_clearly_better(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -137,5 +165,5 @@ def test_check_names_a_choice_that_is_clearly_better(
         sequence.write_text(SEQUENCE.format(planner=planner))
         run_main("check", str(sequence))
         out = capsys.readouterr().out
-        assert ("better     `auto`: " in out) == is_named
+        assert ("better     `auto`, which is grid with " in out) == is_named
         assert (" defects after one cycle, filling 98." in out) == is_named

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from itertools import product
@@ -509,7 +510,7 @@ class PlannerContract:
             planner.warm()
             load_kernels()
         if isinstance(planner, ChoosesPlanner):
-            planner.choose(target)
+            planner.choose(target, math.inf)
         return planner
 
     def on_examples(self, check: Check, *, served: bool = False) -> None:
