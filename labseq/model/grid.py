@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Self, TypeAlias
+from typing import Annotated, Any, Final, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from pydantic import Field, field_validator
 
 from labseq.settings import Frequency, Settings
+
+PAPERS_LOADING: Final = 0.75
+"""Fraction of the sites that hold an atom after loading, where nothing says it."""
 
 Floats: TypeAlias = NDArray[np.float64]
 

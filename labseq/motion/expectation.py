@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +13,6 @@ from labseq.model import MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern
 from labseq.motion.check import check_plan
 from labseq.motion.survival import predict_survival
 from labseq.motion.tones import fitting_batches
-
-PAPERS_LOADING: Final = 0.75
-"""Fraction of the sites that hold an atom where nothing says it."""
 
 
 @dataclass(frozen=True, slots=True)

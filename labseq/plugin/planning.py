@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from labseq.model import PlanReport, follow_atoms
+from labseq.model.grid import PAPERS_LOADING
 from labseq.motion import check_plan, choose_plan, fitting_batches
-from labseq.motion.expectation import PAPERS_LOADING, Expected, expect, random_loadings
+from labseq.motion.expectation import Expected, expect, random_loadings
 
 __all__ = [
     "PAPERS_LOADING",

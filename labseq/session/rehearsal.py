@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from labseq.errors import LabseqError, Problem, StopRequested
 from labseq.guard import Guard
 from labseq.model import Plan, PlanReport
+from labseq.model.grid import PAPERS_LOADING
 from labseq.motion import check_plan, fitting_batches
-from labseq.motion.expectation import PAPERS_LOADING
 from labseq.roles import Step
 from labseq.sequencer.lab import Lab
 
