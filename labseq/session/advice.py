@@ -13,7 +13,7 @@ from labseq.motion.expectation import Expected, expect, random_loadings
 from labseq.roles import ChoosesPlanner, NeedsWarmUp
 from labseq.sequencer.lab import Lab
 from labseq.session.prepared import PreparedRun
-from labseq.session.rehearsal import loading_of, windows_of
+from labseq.session.rehearsal import first_window_s, loading_of
 
 CLEARLY: Final = 0.8
 """Another planner is worth a line if it leaves at most this part of the defects, and half a defect less."""
@@ -31,15 +31,19 @@ def better_planner(run: PreparedRun) -> str:
     entry = assembly.hardware.host.registry.find("planner", "auto")
     if entry is None or entry.settings_model is None or assembly.sequence.planner.use == "auto":
         return ""
-    windows = windows_of(assembly.steps)
+    window_s = first_window_s(assembly.steps)
     # the points of a scan are compared by taking it
-    if assembly.target.is_none or not windows or assembly.scanned is not None or assembly.search is not None:
+    if (
+        assembly.target.is_none
+        or window_s is None
+        or assembly.scanned is not None
+        or assembly.search is not None
+    ):
         return ""
     chosen = ChosenPlugin(entry, entry.settings_model())
     guard = Guard(run.stop_flag)
     try:
         run.warm(lab := run.build_lab(), devices=False)
-        window_s = next(iter(windows.values()))[0]
         now, then, choice = guard.call("planner", WARM_S, _compare, lab, chosen, window_s)
     except StopRequested:
         raise

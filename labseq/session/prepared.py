@@ -20,7 +20,7 @@ from labseq.roles import ChoosesPlanner, RunObserver, Step
 from labseq.sequencer.lab import Lab
 from labseq.session.checks import Analyses
 from labseq.session.observers import Observers
-from labseq.session.rehearsal import windows_of
+from labseq.session.rehearsal import first_window_s
 
 
 class History:
@@ -180,12 +180,12 @@ class PreparedRun:
         Returns:
             What it has chosen, then the alternatives; empty if it has no choice, or nothing is planned.
         """
-        planner, windows = lab.planner, windows_of(steps)
-        if not isinstance(planner, ChoosesPlanner) or not windows or lab.target.is_none:
+        planner, window_s = lab.planner, first_window_s(steps)
+        if not isinstance(planner, ChoosesPlanner) or window_s is None or lab.target.is_none:
             return ()
         guard = Guard(self.stop_flag)
         try:
-            return guard.call("planner", WARM_S, planner.choose, lab.target, next(iter(windows.values()))[0])
+            return guard.call("planner", WARM_S, planner.choose, lab.target, window_s)
         finally:
             guard.end()
 

@@ -73,6 +73,11 @@ def windows_of(steps: Sequence[tuple[str, Step]]) -> dict[int, tuple[float, ...]
     return {number: windows_s for number, windows_s in windows.items() if windows_s}
 
 
+def first_window_s(steps: Sequence[tuple[str, Step]]) -> float | None:
+    """Window of the first cycle of a shot, in seconds; None without a rearrangement."""
+    return next((windows_s[0] for windows_s in windows_of(steps).values()), None)
+
+
 def rehearse(
     guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], n_loadings: int, deadline: float
 ) -> tuple[list[Rehearsal], list[Plan], Problem | None]:

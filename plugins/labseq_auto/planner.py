@@ -96,7 +96,7 @@ class AutoPlanner:
         for name, settings in PLANNERS.items():
             entry = registry.get("planner", name)
             model: Any = entry.settings_model
-            if settings and self._context.motion.path_depth < SHALLOWEST:
+            if "lanes" in settings and self._context.motion.path_depth < SHALLOWEST:
                 depth = f"at a path_depth below {SHALLOWEST:g} more atoms fall out than is predicted"
                 self._why_not.append(f"{name} is left out: {depth}")
                 continue
