@@ -57,8 +57,6 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 def planners(n_loadings: int) -> list[str]:
     """All planners side by side, one after the other so that times are true."""
-    comparison = read_comparison(planners=PLANNERS, dop="15", loadings=n_loadings)
-    report = compare(comparison, Resources(1))
     header = (
         "planner",
         "batches",
@@ -69,14 +67,11 @@ def planners(n_loadings: int) -> list[str]:
         "target met",
         "to the bound",
     )
-    command = f"labseq bench planners --planners {PLANNERS} --dop 15 --loadings {n_loadings} --workers 1"
-    return [*shown(command), *planner_table(header, report)]
+    return planner_table(header, PLANNERS, "15", n_loadings)
 
 
 def variants(n_loadings: int) -> list[str]:
     """The generalised PSCA beside the paper's, with what each loses."""
-    choice, dops = "psca,psca:variant=paper", "2,7,15"
-    report = compare(read_comparison(planners=choice, dop=dops, loadings=n_loadings), Resources(1))
     header = (
         "planner",
         "DOP",
@@ -88,13 +83,15 @@ def variants(n_loadings: int) -> list[str]:
         "defect-free",
         "to the bound",
     )
+    return planner_table(header, "psca,psca:variant=paper", "2,7,15", n_loadings)
+
+
+def planner_table(header: Sequence[str], choice: str, dops: str, n_loadings: int) -> list[str]:
+    """The command that compares planners, and its table with these of the columns."""
+    report = compare(read_comparison(planners=choice, dop=dops, loadings=n_loadings), Resources(1))
     command = f"labseq bench planners --planners {choice} --dop {dops} --loadings {n_loadings} --workers 1"
-    return [*shown(command), *planner_table(header, report)]
-
-
-def planner_table(header: Sequence[str], report: Report) -> list[str]:
-    """A row of the report on each line, with these of its values."""
-    return markdown(header, ([CELLS[name](row) for name in header] for row in report.rows))
+    rows = ([CELLS[name](row) for name in header] for row in report.rows)
+    return [*shown(command), *markdown(header, rows)]
 
 
 def _batches(row: Row) -> str:
