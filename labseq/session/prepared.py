@@ -175,10 +175,9 @@ class PreparedRun:
         warm(lab, self.stop_flag, self.observers, devices=devices)
 
     def choose(self, lab: Lab, steps: Sequence[tuple[str, Step]]) -> Sequence[str]:
-        """Let a planner that chooses how it plans do so, which may take seconds.
+        """What a planner that chooses how it plans has chosen, then the alternatives; it may take seconds.
 
-        Returns:
-            What it has chosen, then the alternatives; empty if it has no choice, or nothing is planned.
+        Empty if the planner has no choice, or nothing is planned.
         """
         planner, window_s = lab.planner, first_window_s(steps)
         if not isinstance(planner, ChoosesPlanner) or window_s is None or lab.target.is_none:
