@@ -9,14 +9,14 @@ from typing import Any, Final, TypeAlias
 
 from labseq import motion as _motion
 from labseq.assembly.calibrations import calibrated_machine
-from labseq.assembly.lab import construct_planner
+from labseq.assembly.planning import construct_planner
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_target, load_plugins
 from labseq.config.profile import load_profile
 from labseq.config.validation import validate_values
 from labseq.errors import ConfigError, Problem
 from labseq.model import MotionSpec, Plan, SiteGrid, TargetPattern, ToneProgram
 from labseq.registry import Entry
-from labseq.roles import Planner
+from labseq.roles import Context, Planner
 
 Folders: TypeAlias = str | Path | Sequence[str | Path]
 """A folder, or several."""
@@ -54,7 +54,9 @@ def make_planner(
     values = validate_values(entry.settings_model, settings, f"planner '{name}'")
     if not isinstance(motion, MotionSpec | None):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise ConfigError(Problem(f"motion is {motion!r}", expected="a labseq.MotionSpec"))
-    return construct_planner(ChosenPlugin(entry, values), _grid(grid), motion or MotionSpec())[0]
+    return construct_planner(
+        ChosenPlugin(entry, values), Context(grid=_grid(grid), motion=motion or MotionSpec())
+    )[0]
 
 
 def make_target(

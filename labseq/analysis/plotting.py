@@ -78,6 +78,9 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, rep
         )
     path = _free_name(request.name if folder is None else "campaign") if output is None else output
     ending = path.suffix.lower()
+    if ending in ANIMATIONS and request.shot is None:
+        what = "an animation shows one cycle of a shot"
+        raise ConfigError(Problem(what, visible(str(path)), expected="--shot N and --cycle K beside it"))
     check_place(path, ENDINGS if request.shot is None else (*ENDINGS, *ANIMATIONS), drawn=ending != ".html")
     if path.exists() and not replace:
         hint = "--force replaces it"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,7 +17,7 @@ from labseq.guard import Guard, StopFlag
 from labseq.kernels.kernel import announcing, load_kernels
 from labseq.model import MotionSpec, RandomStream, SiteGrid, TargetPattern
 from labseq.plugins.calls import call_plugin
-from labseq.roles import Clock, Context, NeedsWarmUp, Planner, RunObserver, Simulation
+from labseq.roles import ChoosesPlanner, Clock, Context, NeedsWarmUp, Planner, RunObserver, Simulation
 from labseq.sequencer.clock import PacedClock, RealClock, VirtualClock
 from labseq.sequencer.lab import Lab
 
@@ -123,17 +124,23 @@ def construct(
     return objects, tuple(streams)
 
 
-def construct_planner(
-    chosen: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int = 0
-) -> tuple[Planner, int]:
-    """Construct a planner without a run, and the maximum number of mobile tweezers in its batches.
+def choice_of(
+    planner: Planner, target: TargetPattern, window_s: float = math.inf, stop: StopFlag | None = None
+) -> Sequence[str]:
+    """What a planner that chooses how it plans has chosen, then the alternatives; it may take seconds.
 
-    Raises:
-        ConfigError: Its constructor refuses its settings.
-        PluginLoadError: Its constructor raised, or made no planner; names the plugin.
+    Empty if the planner has no choice, or nothing is planned. See ``labseq.roles.ChoosesPlanner``.
     """
-    objects, _ = construct({"planner": chosen}, Context(grid=grid, motion=motion), seed)
-    return objects["planner"], parallelism_of(chosen, objects["planner"], motion)
+    if not isinstance(planner, ChoosesPlanner) or target.is_none:
+        return ()
+    guard = Guard(stop)
+    try:
+        if isinstance(planner, NeedsWarmUp):
+            guard.call("planner", WARM_S, planner.warm)
+            load_kernels()
+        return guard.call("planner", WARM_S, planner.choose, target, window_s)
+    finally:
+        guard.end()
 
 
 def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:

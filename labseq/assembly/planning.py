@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from labseq.assembly.calibrations import calibrated_machine
-from labseq.assembly.lab import construct_planner
+from labseq.assembly.lab import choice_of, construct, parallelism_of
 from labseq.assembly.occupancies import Source, read_source
 from labseq.assembly.plugin_choice import (
     ChosenPlugin,
@@ -27,11 +27,12 @@ from labseq.config.profile import load_profile
 from labseq.config.sequence import DEFAULT_PLANNER, load_sequence
 from labseq.errors import ConfigError, InvalidPlanError, LabseqError, LimitError, PlanError, Problem
 from labseq.guard import Guard
+from labseq.kernels.kernel import announcing, interpret
 from labseq.messages import clean, format_plugin_error, visible
 from labseq.model import MotionSpec, Occupancy, Plan, PlanReport, SiteGrid, TargetPattern
 from labseq.motion import Survival, check_plan, predict_survival
 from labseq.plugins.host import PluginHost
-from labseq.roles import Planner
+from labseq.roles import ChoosesPlanner, Context, Planner
 from labseq.settings import Choice, PatternChoice
 
 _NAME: Final = re.compile(r"[^\W\d][\w.-]*")
@@ -218,6 +219,17 @@ def _planner(host: PluginHost, request: PlanRequest, settings: Sequence[Override
     return resolve(host, document, "planner", Choice(use=request.planner).placed("planner"))
 
 
+def construct_planner(chosen: ChosenPlugin, context: Context, seed: int = 0) -> tuple[Planner, int]:
+    """Construct a planner without a run, and the maximum number of mobile tweezers in its batches.
+
+    Raises:
+        ConfigError: Its constructor refuses its settings.
+        PluginLoadError: Its constructor raised, or made no planner; names the plugin.
+    """
+    objects, _ = construct({"planner": chosen}, context, seed)
+    return objects["planner"], parallelism_of(chosen, objects["planner"], context.motion)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedMoves:
     """A checked plan and everything it was made from.
@@ -234,6 +246,7 @@ class PlannedMoves:
         seed: Seed of all random numbers, drawn or given; None if there is none.
         plan: The plan.
         report: Result of the check; of a refused plan, that of the batches before the refused one.
+        choice: What the planner chose for the target, then the alternatives; empty if it has no choice.
         refused: The rule that the plan breaks in a batch; None for a valid plan.
     """
 
@@ -248,6 +261,7 @@ class PlannedMoves:
     seed: int | None
     plan: Plan
     report: PlanReport
+    choice: Sequence[str] = ()
     refused: InvalidPlanError | None = None
 
     @property
@@ -283,26 +297,30 @@ def plan_moves(
     *,
     announce: Callable[[float], None] = lambda _: None,
     keep_refused: bool = False,
+    once: bool = False,
 ) -> PlannedMoves:
     """Plan once, and check the plan as a run does.
 
     Args:
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
         keep_refused: Whether a plan that breaks a rule in one of its batches is returned, too.
+        once: Whether this process plans only once.
 
     Raises:
         ConfigError: The request has an error; says what was expected.
         PluginLoadError: A plugin that is named failed to load.
         PlanError: The planner failed, or its plan breaks a rule.
     """
-    from labseq.kernels.kernel import announcing
-
     source = source or read_source(request.occupancy, request.seed)
     occupancy, seed = source.occupancy, request.seed if source.seed is None else source.seed
     inputs = read_inputs(request, source)
     grid, motion, target = inputs.machine.grid, inputs.machine.motion, inputs.target
-    planner, dop = construct_planner(inputs.planner, grid, motion, seed or 0)
+    planner, dop = construct_planner(inputs.planner, Context(grid=grid, motion=motion), seed or 0)
+    # planning once in plain Python is faster than loading numba, but choosing plans a hundred times
+    if once and occupancy.size <= 64 * 64 and not isinstance(planner, ChoosesPlanner):
+        interpret()
     with announcing(announce):
+        choice = choice_of(planner, target)
         plan, refused = call_planner(planner, request.planner, occupancy, target), None
         try:
             report = check_plan(plan, occupancy, target, dop, grid, motion, request.planner)
@@ -324,6 +342,7 @@ def plan_moves(
         seed=seed,
         plan=plan,
         report=report,
+        choice=choice,
         refused=refused,
     )
 

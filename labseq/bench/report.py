@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from labseq.assembly.lab import choice_of
 from labseq.bench.comparison import BARE_MOTION, Comparison, Condition, PlannerEntry
 from labseq.bench.work import Failure, JobResults, PreparedCondition, loading_seed
 from labseq.console.report import Column, table
@@ -158,6 +159,8 @@ def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
     for key, value in values.items():
         if key == "settings":
             flat[key] = " ".join(f"{name}={inner}" for name, inner in value.items())
+        elif key == "choice":
+            flat[key] = value[0] if value else ""
         elif isinstance(value, dict):
             flat |= {f"{key}_{name}": inner for name, inner in value.items()}
         else:
@@ -197,6 +200,7 @@ def _identity(
         "planner": entry.planner,
         "label": entry.label,
         "settings": dict(runner.settings),
+        "choice": list(choice_of(runner.planner, prepared.target)),
         "degree_of_parallelism": runner.degree_of_parallelism,
         "grid": dict(zip(("rows", "cols"), condition.shape, strict=True)),
         "target": condition.target,
@@ -273,6 +277,7 @@ def notes(report: Report) -> list[str]:
             few = f"{row['n_short']} of {row['n_loadings']} loadings hold fewer atoms"
             lines.append(f"{few} than {row['target_name']} has sites")
     for row in report.rows:
+        lines += [f"{row['label']} chose {text}" for text in row["choice"][:1]]
         if row.first_failure is not None:
             lines += _failure(comparison, row, row.first_failure)
     return lines

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Final
@@ -12,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.assembly.lab import construct_planner
-from labseq.assembly.planning import TargetChoice, read_target
+from labseq.assembly.lab import choice_of
+from labseq.assembly.planning import TargetChoice, construct_planner, read_target
 from labseq.assembly.plugin_choice import ChosenPlugin, dump, load_plugins, resolve
 from labseq.bench.comparison import Comparison, Condition, PlannerEntry
 from labseq.config.addresses import Override
@@ -24,10 +25,9 @@ from labseq.messages import format_plugin_error
 from labseq.model import MotionSpec, Occupancy, SiteGrid, TargetPattern
 from labseq.motion import check_plan, predict_survival
 from labseq.plugins.host import PluginHost
-from labseq.roles import NeedsWarmUp, Planner
+from labseq.roles import Context, NeedsWarmUp, Planner
 from labseq.settings import Choice, settings_at
 
-_DOP: Final = "degree_of_parallelism"
 _MOTION_ADDRESS: Final = "profile.mobile_tweezers"
 
 
@@ -67,15 +67,26 @@ def set_up(comparison: Comparison) -> list[PreparedCondition]:
 
 
 def warm(prepared: list[PreparedCondition]) -> None:
-    """Compile all kernels that will be needed, or load them from the cache."""
+    """Compile or load all kernels that will be needed, and let planners choose how they plan."""
     importlib.import_module("labseq.motion.check_kernels")  # else the first plan would wait for them
     for runner in [runner for condition in prepared for runner in condition.runners]:
         if isinstance(runner.planner, NeedsWarmUp):
-            try:
+            with _naming(runner, "warm"):
                 runner.planner.warm()
-            except Exception as error:
-                raise PlanError(f"warm() raised {format_plugin_error(error)}", runner.name) from error
     load_kernels()
+    for condition in prepared:
+        for runner in condition.runners:
+            with _naming(runner, "choose"):
+                choice_of(runner.planner, condition.target)
+
+
+@contextmanager
+def _naming(runner: Runner, call: str) -> Generator[None]:
+    """Name the planner whose call raises."""
+    try:
+        yield
+    except Exception as error:
+        raise PlanError(f"{call}() raised {format_plugin_error(error)}", runner.name) from error
 
 
 def _prepare(
@@ -129,16 +140,18 @@ def _planner(
     overrides += [
         Override(f"planner.{key}", value, comparison.called) for key, value in planner_entry.settings
     ]
+    of_condition = ("degree_of_parallelism", dop, "--dop"), ("loading", condition.loading, "--loading")
     entry = host.registry.find("planner", name)
-    if entry is not None and dop is not None and settings_at(entry.settings_model, (_DOP,)):
-        overrides.insert(0, Override(f"planner.{_DOP}", str(dop), f"--dop {dop}"))
+    for key, value, option in of_condition:
+        if entry is not None and value is not None and settings_at(entry.settings_model, (key,)):
+            overrides.insert(0, Override(f"planner.{key}", str(value), f"{option} {value}"))
     overrides.insert(0, Override("planner.use", name, comparison.called))
     document = Document.of_options(overrides, comparison.called)
     return resolve(host, document, "planner", Choice(use=name).placed("planner"))
 
 
 def _runner(choice: ChosenPlugin, grid: SiteGrid, motion: MotionSpec, seed: int) -> Runner:
-    planner, dop = construct_planner(choice, grid, motion, seed)
+    planner, dop = construct_planner(choice, Context(grid=grid, motion=motion), seed)
     return Runner(planner, choice.entry.name, dump(choice.entry, choice.settings), dop)
 
 

@@ -25,6 +25,7 @@ from labseq.errors import Problem
 from labseq.messages import clean, visible
 from labseq.model import CalibrationEntry, LossSpec, TimelineEntry
 from labseq.model.policies import StepPolicy
+from labseq.sequencer.line_spans import spans_on
 from labseq.session.advice import better_planner
 from labseq.session.check import CheckReport, check
 from labseq.session.rehearsal import Rehearsal
@@ -163,6 +164,8 @@ class CheckedSequence:
         limits: The same of what limits it: windows, attempts, policies, timeouts.
         shot_s: Shortest and longest duration of a shot.
         run_s: The same of the run.
+        lines: Name of each line -> when it is on in the longest shot, as (start, end) in seconds.
+        idle_outputs: Name of each device that puts out something when nothing plays -> what.
     """
 
     about: Facts
@@ -195,8 +198,10 @@ class CheckedSequence:
             points=checked.n_points,
             points_are_chosen=assembly.search is not None,
             run_s=checked.run_s,
-            lines=checked.lines,
-            idle_outputs=checked.idle_outputs,
+            lines=spans_on(checked.lab.line_specs, checked.bars),
+            idle_outputs={
+                name: text for name, device in checked.lab.hardware() if (text := device.idle_output)
+            },
             n_images=checked.n_images,
             shot_bytes=checked.shot_bytes,
             run_bytes=None if checked.shot_bytes is None else checked.n_shots * checked.shot_bytes,
@@ -258,7 +263,7 @@ def check_sequence(
             sequence, profile=profile, overrides=overrides, dry_run=dry_run, observer=LogLines(sys.stderr)
         )
         checked = check(session)
-        show(CheckedSequence.of(session.assembly, checked, better_planner(session)))
+        show(CheckedSequence.of(session.assembly, checked, better_planner(session, checked.lab)))
     if not as_json:
         for warning in checked.warnings:
             say(*warning_lines(warning), stream=sys.stderr)

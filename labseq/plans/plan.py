@@ -19,7 +19,6 @@ from labseq.console.arrays import ArrayPair, glyphs_for
 from labseq.console.output import STDOUT, check_different, json_writer, report_compiling, say, writing_to
 from labseq.console.report import Facts, aligned
 from labseq.console.text import count_of, encodes, percent, plural
-from labseq.kernels.kernel import interpret
 from labseq.model import Batch, TonePaths
 from labseq.motion import Survival
 from labseq.pictures.plans import occupancies, on_grid
@@ -56,10 +55,7 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
         from labseq.pictures.animations import check_animation
 
         check_animation(output.animate, source.occupancy.shape)
-    # planning once in plain Python is faster than loading numba; `auto` plans a hundred times to choose
-    if source.occupancy.size <= 64 * 64 and request.planner != "auto":
-        interpret()
-    moves = plan_moves(request, source, announce=report_compiling, keep_refused=True)
+    moves = plan_moves(request, source, announce=report_compiling, keep_refused=True, once=True)
     report = PlanReport.of(moves)
     if output.png is not None:
         _draw(moves, output.png)
@@ -286,6 +282,7 @@ def subject(moves: PlannedMoves) -> Facts:
         ("occupancy", f"{moves.source}: {plural(int(moves.occupancy.sum()), 'atom')} on {sites}"),
         ("target", f"{target.name}: {atoms}"),
         ("planner", "".join([moves.planner, dop, *settings])),
+        *(("or" if n else "chosen", text) for n, text in enumerate(moves.choice)),
     ]
 
 
@@ -308,6 +305,7 @@ class PlanReport:
         n_filled: Sites of the target that hold an atom after the plan.
         n_surplus: Atoms that are left on sites to be empty.
         survival: What the plan costs, by the losses of the profile.
+        choice: What the planner chose for the target, then the alternatives.
         batches: The batches; the sites of ejected atoms are off the grid.
         predicted: The occupancy after the plan; of a refused plan, after the batches before the refused one.
         refused: The rule that the plan breaks, if it does.
@@ -327,6 +325,7 @@ class PlanReport:
     n_filled: int
     n_surplus: int
     survival: Survival
+    choice: Sequence[str]
     batches: Sequence[Mapping[str, Any]]
     predicted: NDArray[np.integer[Any]]
     refused: Refusal | None
@@ -351,6 +350,7 @@ class PlanReport:
             n_filled=moves.n_filled,
             n_surplus=report.n_surplus,
             survival=moves.survival,
+            choice=moves.choice,
             batches=[_batch(batch) for batch in plan.batches],
             predicted=report.predicted.astype(int),
             refused=None if refused is None else Refusal(refused.batch, refused.move, str(refused)),

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from labseq.model import PlanReport, follow_atoms
-from labseq.model.grid import PAPERS_LOADING
 from labseq.motion import check_plan, choose_plan, fitting_batches
 from labseq.motion.expectation import Expected, expect, random_loadings
+from labseq.roles import loading_of
 
 __all__ = [
-    "PAPERS_LOADING",
     "Expected",
     "PlanReport",
     "check_plan",
@@ -16,5 +15,6 @@ __all__ = [
     "expect",
     "fitting_batches",
     "follow_atoms",
+    "loading_of",
     "random_loadings",
 ]

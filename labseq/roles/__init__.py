@@ -47,6 +47,7 @@ from labseq.roles.simulation import (
     Signal,
     Simulation,
     ToneSource,
+    loading_of,
 )
 from labseq.roles.table import ROLES, in_opening_order, in_safe_order, overrides
 
@@ -89,6 +90,7 @@ __all__ = [
     "in_opening_order",
     "in_safe_order",
     "leaders",
+    "loading_of",
     "overrides",
     "unknown_name",
 ]

@@ -18,6 +18,7 @@ from labseq.model import (
     ToneProgram,
     TweezerAmplitudes,
 )
+from labseq.model.grid import PAPERS_LOADING
 
 Signal: TypeAlias = ToneProgram | DepthRamp | TweezerAmplitudes | LineProgram
 """The output of a device that the simulation acts on."""
@@ -137,6 +138,12 @@ class Simulation(ABC):
         """
         del since_s
         return {}
+
+
+def loading_of(simulation: Simulation | None) -> float:
+    """Fraction of the sites that hold an atom after loading, as a simulation says, else as in the paper."""
+    simulated = None if simulation is None else simulation.loading_probability
+    return PAPERS_LOADING if simulated is None else simulated
 
 
 class RfSource(Protocol):

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Final
 
-from labseq.assembly.lab import WARM_S, construct_planner
+from labseq.assembly.lab import WARM_S, choice_of
+from labseq.assembly.planning import construct_planner
 from labseq.assembly.plugin_choice import ChosenPlugin
 from labseq.errors import LabseqError, StopRequested
 from labseq.guard import Guard
-from labseq.kernels.kernel import load_kernels
 from labseq.motion.expectation import Expected, expect, random_loadings
-from labseq.roles import ChoosesPlanner, NeedsWarmUp
+from labseq.roles import Context, loading_of
 from labseq.sequencer.lab import Lab
 from labseq.session.prepared import PreparedRun
-from labseq.session.rehearsal import first_window_s, loading_of
+from labseq.session.rehearsal import first_window_s
 
 CLEARLY: Final = 0.8
 """Another planner is worth a line if it leaves at most this part of the defects, and half a defect less."""
@@ -21,11 +21,12 @@ N_LOADINGS: Final = 12
 """Number of random loadings for which the two are compared."""
 
 
-def better_planner(run: PreparedRun) -> str:
+def better_planner(run: PreparedRun, lab: Lab) -> str:
     """A line if the planner `auto` is expected to leave clearly fewer defects than that of a run; else "".
 
     Args:
         run: The run; it has been checked.
+        lab: The lab at its first point, with warm kernels.
     """
     assembly = run.assembly
     entry = assembly.hardware.host.registry.find("planner", "auto")
@@ -43,7 +44,6 @@ def better_planner(run: PreparedRun) -> str:
     chosen = ChosenPlugin(entry, entry.settings_model())
     guard = Guard(run.stop_flag)
     try:
-        run.warm(lab := run.build_lab(), devices=False)
         now, then, choice = guard.call("planner", WARM_S, _compare, lab, chosen, window_s)
     except StopRequested:
         raise
@@ -59,12 +59,11 @@ def better_planner(run: PreparedRun) -> str:
 
 def _compare(lab: Lab, auto: ChosenPlugin, window_s: float) -> tuple[Expected, Expected, str]:
     """What the lab's planner and `auto` are expected to leave, and which planner that is."""
-    planner, most = construct_planner(auto, lab.grid, lab.motion)
-    if isinstance(planner, NeedsWarmUp):
-        planner.warm()
-        load_kernels()
-    choice = planner.choose(lab.target, window_s)[0] if isinstance(planner, ChoosesPlanner) else ""
-    loadings = random_loadings(lab.target.shape, loading_of(lab), N_LOADINGS)
+    planner, most = construct_planner(
+        auto, Context(grid=lab.grid, motion=lab.motion, simulation=lab.simulation)
+    )
+    choice, *_ = choice_of(planner, lab.target, window_s)
+    loadings = random_loadings(lab.target.shape, loading_of(lab.simulation), N_LOADINGS)
     limits = (lab.planner, lab.degree_of_parallelism), (planner, most)
     now, then = (
         expect(one.plan, loadings, lab.target, n, lab.grid, lab.motion, window_s) for one, n in limits

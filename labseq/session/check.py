@@ -8,7 +8,7 @@ import shlex
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, TypeAlias
 
@@ -23,7 +23,7 @@ from labseq.errors import ConfigError, LabseqError, LimitError, Loc, Problem, Pr
 from labseq.files import free_bytes
 from labseq.guard import Guard
 from labseq.messages import visible
-from labseq.model import COMPUTER, Frame, LineSpec, Plan, TimelineEntry
+from labseq.model import COMPUTER, Frame, Plan, TimelineEntry
 from labseq.model.lines import NO_PULSES, LineProgram, Pulses
 from labseq.motion import tone_program
 from labseq.roles import Detector, Step, find_leader
@@ -316,8 +316,7 @@ class CheckReport:
         rehearsal: The planner's results for random loadings; None without a rearrangement.
         shot_bytes: Size of a shot on disk at most; None if the camera does not report its frame shape.
         free_bytes: Free space on the disk of the data folder.
-        line_specs: The lines of the timing box.
-        idle_outputs: Name of each device that puts out something when nothing plays -> what.
+        lab: Devices and planner at the first point; none is open.
         planner_choice: What the planner has chosen for the target, then the alternatives.
     """
 
@@ -329,21 +328,13 @@ class CheckReport:
     rehearsal: Rehearsal | None
     shot_bytes: int | None
     free_bytes: int
-    line_specs: Sequence[LineSpec] = ()
-    idle_outputs: Mapping[str, str] = field(default_factory=dict[str, str])
+    lab: Lab
     planner_choice: Sequence[str] = ()
 
     @property
     def bars(self) -> list[TimelineEntry]:
         """The bars of all steps."""
         return [bar for _, bars in self.timeline for bar in bars]
-
-    @property
-    def lines(self) -> Mapping[str, Sequence[tuple[float, float]]]:
-        """Name of each line -> when it is on in the longest shot, as (start, end) in seconds."""
-        from labseq.sequencer.line_spans import spans_on
-
-        return spans_on(self.line_specs, self.bars)
 
     @property
     def longest_shot_s(self) -> float:
@@ -411,8 +402,7 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         next(iter(rehearsals.values()), None),
         shot_bytes,
         free,
-        first.lab.line_specs,
-        {name: text for name, device in first.lab.hardware() if (text := device.idle_output)},
+        first.lab,
         run.choose(first.lab, first.point.steps),
     )
 

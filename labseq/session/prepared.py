@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Protocol
 
 from labseq.assembly.assemble import Assembly
-from labseq.assembly.lab import WARM_S, build_lab, clock_for, warm
+from labseq.assembly.lab import build_lab, choice_of, clock_for, warm
 from labseq.assembly.point import Point
 from labseq.data.reader import Run
 from labseq.data.shot import CachingLoader, Shot
-from labseq.guard import Guard, StopFlag
+from labseq.guard import StopFlag
 from labseq.recording.index import IndexRow
-from labseq.roles import ChoosesPlanner, RunObserver, Step
+from labseq.roles import RunObserver, Step
 from labseq.sequencer.lab import Lab
 from labseq.session.checks import Analyses
 from labseq.session.observers import Observers
@@ -179,14 +179,8 @@ class PreparedRun:
 
         Empty if the planner has no choice, or nothing is planned.
         """
-        planner, window_s = lab.planner, first_window_s(steps)
-        if not isinstance(planner, ChoosesPlanner) or window_s is None or lab.target.is_none:
-            return ()
-        guard = Guard(self.stop_flag)
-        try:
-            return guard.call("planner", WARM_S, planner.choose, lab.target, window_s)
-        finally:
-            guard.end()
+        window_s = first_window_s(steps)
+        return () if window_s is None else choice_of(lab.planner, lab.target, window_s, self.stop_flag)
 
     def choose_planner(self, lab: Lab, point: Point) -> None:
         """Let a planner that chooses how it plans do so, and log it."""

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from labseq.errors import LabseqError, Problem, StopRequested
 from labseq.guard import Guard
 from labseq.model import Plan, PlanReport
-from labseq.model.grid import PAPERS_LOADING
 from labseq.motion import check_plan, fitting_batches
-from labseq.roles import Step
+from labseq.roles import Step, loading_of
 from labseq.sequencer.lab import Lab
 
 SURVIVAL: Final = 0.98
@@ -55,12 +54,6 @@ class Rehearsal:
         return quantile(self.duration_s, share)
 
 
-def loading_of(lab: Lab) -> float:
-    """Fraction of the sites that hold an atom, as the simulation says, else as in the paper."""
-    simulated = None if lab.simulation is None else lab.simulation.loading_probability
-    return PAPERS_LOADING if simulated is None else simulated
-
-
 def quantile(values: NDArray[np.float64], share: float) -> float:
     """Quantile of at least one value; those of numpy would import ``numpy.ma``, which takes 40 ms."""
     ranks = np.arange(len(values))
@@ -86,7 +79,7 @@ def rehearse(
     Returns:
         The results of each rearrangement, some of the plans, and the planner's failure.
     """
-    loading = loading_of(lab)
+    loading = loading_of(lab.simulation)
     shots: list[list[FirstCycle]] = []
     cycles: list[FirstCycle] = []
 

@@ -243,8 +243,10 @@ class Api:
         how and when it goes: ejected, lost, or missing on the next image. `cycle` counts all of the shot.
         """
         run = self._opened(request)
-        shot = run.shot(self._line(run, request))
-        return play_back_cycle(shot, _number(request.path_params, "cycle", 0)).as_json()
+        shot, cycle = run.shot(self._line(run, request)), _number(request.path_params, "cycle", 0)
+        if not 0 <= cycle < len(shot.cycles):
+            raise NoSuchRun(f"the shot has no cycle {cycle}")
+        return play_back_cycle(shot, cycle).as_json()
 
     async def frame(self, request: Request) -> Response:
         """A frame of a shot in 8 bit, its darkest pixels black and its brightest white."""

@@ -22,7 +22,7 @@ from labseq.plugin import (
     TargetPattern,
     as_occupancy,
 )
-from labseq.plugin.planning import PAPERS_LOADING, Expected, expect, random_loadings
+from labseq.plugin.planning import Expected, expect, loading_of, random_loadings
 
 
 class AutoSettings(Settings):
@@ -80,9 +80,7 @@ class AutoPlanner:
 
     def __init__(self, settings: AutoSettings, context: Context, registry: Registry) -> None:
         self._context = context
-        simulated = None if context.simulation is None else context.simulation.loading_probability
-        given = (loading for loading in (settings.loading, simulated) if loading is not None)
-        self._loading = next(given, PAPERS_LOADING)
+        self._loading = loading_of(context.simulation) if settings.loading is None else settings.loading
         self._why_not: list[str] = []
         self._candidates = self._all(registry)
         self.degree_of_parallelism = max(candidate.tweezers for candidate in self._candidates)

@@ -116,5 +116,5 @@ def test_a_cycle_of_a_recorded_shot_is_animated(compact: Run, tmp_path: Path) ->
     ):
         with pytest.raises(ConfigError, match=reported):
             plot_run(compact.path, PlotRequest(shot=1, cycle=number), tmp_path / "other.gif")
-    with pytest.raises(ConfigError, match=r"ends in .png or .svg or .pdf$"):
+    with pytest.raises(ConfigError, match=r"an animation shows one cycle of a shot; expected --shot N"):
         plot_run(compact.path, PlotRequest(), tmp_path / "overview.gif")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import labseq_auto
@@ -140,6 +141,33 @@ def test_check_and_record_say_what_was_chosen(tmp_path: Path, capsys: pytest.Cap
     assert {"psca", "grid", "auto"} <= {
         plugin["name"].removeprefix("labseq_") for plugin in run.record["plugins"]
     }
+
+
+def test_every_command_chooses_for_the_loading_at_hand(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """That of the simulation, or that which planners are compared on; not always 75 %."""
+    sequence = tmp_path / "chosen.yaml"
+
+    def said(heading: str, *arguments: str) -> str:
+        run_main(*arguments)
+        (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith(heading))
+        return line
+
+    def checked(heading: str, planner: str) -> str:
+        sequence.write_text(SEQUENCE.format(planner=planner))
+        line = said(heading, "check", str(sequence), "--set=profile.simulation.loading=90%")
+        return re.findall(r"(grid with \d+ tweezers).*?(filling [\d.]+ %)", line)[0]
+
+    assert checked("chosen ", "{use: auto}") == checked("better ", "{use: psca}")
+    options = "bench", "planners", "--planners=auto", "--loadings=1"
+    assert said("auto chose ", *options, "--loading=90%") != said("auto chose ", *options)
+
+
+def test_plan_says_what_was_chosen(capsys: pytest.CaptureFixture[str]) -> None:
+    target = "{pattern: compact, rows: 15, cols: 15}"
+    run_main("plan", "random:20x20@0.75", "--seed=1", "--target", target, "--planner=auto")
+    assert "chosen     grid with" in capsys.readouterr().out
 
 
 def test_each_point_of_a_scan_has_its_choice_before_its_shot(tmp_path: Path) -> None:

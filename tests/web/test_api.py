@@ -91,6 +91,8 @@ def test_every_address_of_the_description_answers(client: Any, run_dir: Path) ->
         (kind,) = methods["get"]["responses"]["200"]["content"]
         assert answer.headers["content-type"].startswith(kind)
         assert methods["get"]["summary"]
+    answer = client.get(f"/api/v1/runs/{run_dir.parent.name}/{run_dir.name}/shots/0/motion/99")
+    assert (answer.status_code, answer.json()) == (404, {"error": "the shot has no cycle 99"})
 
 
 def test_a_run_without_settings_has_no_motion(client: Any, run_dir: Path) -> None:
