@@ -78,6 +78,9 @@ PICTURES: Final = {
         ),
         "grid_waveform.png",
     ),
+    "grid_plan.png": Picture(
+        "explanation/grid-planner.md", (f"{_COMPACT} --planner grid --png plan.png",), "plan.png"
+    ),
     "scan_window.png": Picture(
         "tutorials/scan.md",
         ("labseq run window.yaml --seed 1", "labseq plot --what scan -o window.png"),
@@ -138,7 +141,9 @@ def save_small(made: Path, path: Path) -> None:
     with Image.open(made) as picture:
         small = picture.convert("RGB")
     small.thumbnail((WIDTH_PX, 10 * WIDTH_PX))
-    small.quantize(N_COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+    # the default method would turn the few pixels of a colour map to grey
+    method = Image.Quantize.MAXCOVERAGE
+    small.quantize(N_COLOURS, method, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def files_of(page: Path) -> dict[str, str]:

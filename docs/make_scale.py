@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,7 +47,7 @@ CHUNK: Final = 1 << 18
 """Samples that are rendered at a time, as by a card's driver."""
 PLANNERS: Final[dict[str, tuple[Any, Any]]] = {
     "psca": (PscaPlanner, PscaSettings),
-    "grid": (GridPlanner, GridSettings),
+    "grid": (GridPlanner, partial(GridSettings, lanes="straight")),
     "tetris": (TetrisPlanner, LineSettings),
     "mta1": (Mta1Planner, LineSettings),
 }

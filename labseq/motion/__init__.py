@@ -13,7 +13,7 @@ from labseq.motion.axes import (
     fit_comb,
 )
 from labseq.motion.check import RULES, check_plan
-from labseq.motion.survival import Survival, choose_plan, predict_survival
+from labseq.motion.survival import Survival, choose_plan, pass_hazard, predict_survival
 from labseq.motion.tones import fitting_batches, tone_program
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "drive",
     "fit_comb",
     "fitting_batches",
+    "pass_hazard",
     "predict_survival",
     "tone_program",
     "warm",

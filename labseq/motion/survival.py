@@ -166,6 +166,31 @@ def choose_plan(
     return min(plans, key=rank)
 
 
+PASSED_M: Final = 1.944e-6
+"""Distance of a pass that costs ``losses.passing``: that of a straight lane of the paper's lattice."""
+# From 1.944 to 2.4 um the barrier of a static tweezer of 300 uK beside one of 2.1 mK rises by 290 to 310 uK
+# per um, and the loss falls by e for each 36 uK (fitted to flights of whole plans).
+PASS_DECAY_M: Final = 0.12e-6
+"""Additional distance at which a pass costs a factor e less."""
+
+
+def pass_hazard(motion: MotionSpec, distance_m: float) -> float:
+    """Hazard of an atom that a tweezer passes at a distance; that of the tweezer's own atom is the same.
+
+    Args:
+        motion: Its losses, and the depth of tweezers on paths.
+        distance_m: Least distance of the tweezer from the atom, in metres.
+
+    Example:
+        >>> motion = MotionSpec(losses=LossSpec(passing=0.01))
+        >>> round(pass_hazard(motion, PASSED_M + PASS_DECAY_M) / pass_hazard(motion, PASSED_M), 3)
+        0.368
+    """
+    # A shallower tweezer lowers the barrier between the two wells less; the exponent is fitted to flights.
+    at_full_depth = -math.log1p(-motion.losses.passing) * math.exp((PASSED_M - distance_m) / PASS_DECAY_M)
+    return at_full_depth * motion.path_depth**2.2
+
+
 MOVED, LANDED, PASSED = range(3)
 """Causes of the hazards."""
 
@@ -173,8 +198,7 @@ MOVED, LANDED, PASSED = range(3)
 def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, motion: MotionSpec) -> tuple[Floats, int, int]:
     """Hazards of the atom that ends on each site, float64 (3, n_rows, n_cols); landings and passes."""
     losses = motion.losses
-    # A shallower tweezer lowers the barrier between the two wells less; the exponent is fitted to flights.
-    pass_hazard = -math.log1p(-losses.passing) * motion.path_depth**2.2
+    hazard = pass_hazard(motion, PASSED_M)
     hazards = np.zeros((3, *grid.shape))
     if not len(plan.path_shapes):
         from labseq.motion.survival_kernels import line_hazards
@@ -197,8 +221,8 @@ def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, motion: MotionSpec
             if losses.passing > 0:
                 tones = batch.tones.tones_of(batch.from_sites)
                 of_site, of_tweezer, n = _passes(batch.tones, atoms, grid)
-                hazards[PASSED] += pass_hazard * of_site
-                before[PASSED] += pass_hazard * of_tweezer[tones[:, 0], tones[:, 1]]
+                hazards[PASSED] += hazard * of_site
+                before[PASSED] += hazard * of_tweezer[tones[:, 0], tones[:, 1]]
                 n_passes += n
         to_row, to_col = batch.to_sites.T
         stays = (to_row >= 0) & (to_row < grid.n_rows) & (to_col >= 0) & (to_col < grid.n_cols)
@@ -256,9 +280,6 @@ def _passes(paths: TonePaths, atoms: Occupancy, grid: SiteGrid) -> tuple[Floats,
     positions = np.concatenate([paths.row.ravel(), paths.column.ravel()])
     off = np.concatenate([paths.row_off, paths.column_off]).astype(np.int32)
     a1, a2 = grid.axes / grid.spacing_m
-    # The loss by passing is that of the profile at 1.944 um, as in a straight lane of the paper's lattice.
-    # From there to 2.4 um the barrier of a static tweezer of 300 uK beside one of 2.1 mK rises by 290 to
-    # 310 uK per um, and the loss falls by e for each 36 uK (fitted to flights of whole plans).
-    distances = BESIDE, 1.944e-6 / grid.spacing_m, 0.12e-6 / grid.spacing_m
+    distances = BESIDE, PASSED_M / grid.spacing_m, PASS_DECAY_M / grid.spacing_m
     n = add_passes(positions, off, paths.shape, atoms, float(a1 @ a2), distances, of_site, of_tweezer)
     return of_site, of_tweezer, n

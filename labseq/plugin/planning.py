@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from labseq.model import PlanReport, follow_atoms
-from labseq.motion import check_plan, choose_plan, fitting_batches
+from labseq.motion import check_plan, choose_plan, fitting_batches, pass_hazard
 from labseq.motion.expectation import Expected, expect, random_loadings
 from labseq.roles import loading_of
 
@@ -16,5 +16,6 @@ __all__ = [
     "fitting_batches",
     "follow_atoms",
     "loading_of",
+    "pass_hazard",
     "random_loadings",
 ]

@@ -1,13 +1,12 @@
 """Kernels that choose the columns of a batch whose rows are given.
 
-A batch takes the atoms of ``n`` source rows to as many goal rows, in order, and those of its source
+A batch takes the atoms of ``k`` source rows to as many goal rows, in order, and those of its source
 columns to as many goal columns, in order. What a column holds in these rows is a *pattern*: bit i stands
-for row i. An atom is *carried* if its column is chosen; so a source column with pattern a can go to a goal
-column with the vacancies b if a is part of b.
+for row i. A source column with pattern a can go to a goal column with the vacancies b if a is part of b.
 
-In all kernels ``source``, uint8 (n_rows, n_cols), is EMPTY, SPARE or STAYS; ``vacant``, uint8 of the same
-shape, is 1 where an atom may be dropped off. ``spare``, int64 (2**n, n_cols + 1), is for each pattern and
-column the first column from there on that has exactly this pattern, or NOWHERE.
+What a batch costs is the expected number of atoms lost, less what no way to its vacancies avoids. In all
+kernels ``rows``, int64 (2, >= k), are the source rows and the goal rows, ascending, and ``columns``, int64
+(3, n_cols), pattern, goal and source of each column, ascending.
 """
 
 from __future__ import annotations
@@ -20,193 +19,270 @@ from numpy.typing import NDArray
 from labseq.plugin import helper_kernel
 
 Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 EMPTY: Final = 0
 SPARE: Final = 1
-STAYS: Final = 2
-NOWHERE: Final = 1 << 20
+UNWANTED: Final = 2
+STAYS: Final = 3
+
+MAX_ROWS: Final = 4
+"""Maximum number of rows of a batch."""
+TOLERANCE: Final = 1e-9
+"""Losses that differ by less, in atoms, are equal: otherwise rounding would decide."""
+
+Lattice = tuple[Bytes, Bytes, Floats]
+"""The sites of one orientation: EMPTY, SPARE, UNWANTED or STAYS, uint8 (n_rows, n_cols); 1 where an atom may
+be dropped off, uint8; losses that no way to a vacancy avoids, float64; arrays of the same shape."""
+LATTICE: Final = "Tuple((uint8[:, ::1], uint8[:, ::1], float64[:, ::1]))"
+Limits = tuple[int, int, int, int]
+"""Maximum number of tweezers, of rows and of columns of a batch; of columns from a source to its goal."""
+LIMITS: Final = "UniTuple(int64, 4)"
+Costs = tuple[float, float, float, float, float]
+"""Expected losses: of a batch without ways, of one site of its longest way, of a further stage of its
+drop-off, of one site of the way of a tweezer (its atom costs as much again), of taking an atom that might
+stay where others must go."""
+COSTS: Final = "UniTuple(float64, 5)"
+Work = tuple[Ints, Floats, Floats, NDArray[np.int16], Ints, Floats, Floats]
+"""Work space, see :func:`workspace`."""
+WORK: Final = (
+    "Tuple((int64[::1], float64[::1], float64[::1], int16[:, ::1], int64[::1], float64[::1], float64[::1]))"
+)
+View = tuple[Lattice, Limits, Costs, Work]
+"""One orientation of the grid: rows and columns as they are, or swapped."""
+VIEW: Final = f"Tuple(({LATTICE}, {LIMITS}, {COSTS}, {WORK}))"
 
 
-@helper_kernel()
-def n_bits(pattern: int) -> int:
-    """Count the bits of a pattern of at most 8 rows."""
-    twos = pattern - ((pattern >> 1) & 0x55)
-    fours = (twos & 0x33) + ((twos >> 2) & 0x33)
-    return (fours + (fours >> 4)) & 0xF
+@helper_kernel(f"{WORK}(int64)")
+def workspace(n: int) -> Work:
+    """Work space for lines of up to ``n`` sites, see :func:`match_columns`.
 
-
-@helper_kernel()
-def pattern_of(vacant: Bytes, rows: Ints, n: int, col: int) -> int:
-    """The pattern of a column of sites that are 0 or 1."""
-    pattern = 0
-    for i in range(n):
-        pattern |= int(vacant[rows[i], col]) << i
-    return pattern
-
-
-@helper_kernel("void(uint8[:, ::1], int64[::1], int64, int64[:, ::1])")
-def find_spare(source: Bytes, rows: Ints, n: int, spare: Ints) -> None:
-    """Fill ``spare`` for some source rows; a column with an atom that stays has no pattern."""
-    n_cols = source.shape[1]
-    for pattern in range(1, 1 << n):
-        spare[pattern, n_cols] = NOWHERE
-    for col in range(n_cols - 1, -1, -1):
-        found = 0
-        for i in range(n):
-            atom = int(source[rows[i], col])
-            found |= (atom & 1) << i | (atom >> 1) << 16
-        for pattern in range(1, 1 << n):
-            spare[pattern, col] = spare[pattern, col + 1]
-        if 0 < found < 1 << 16:
-            spare[found, col] = col
-
-
-@helper_kernel("int64(int64[:, ::1], int64, uint8[:, ::1], int64[::1], int64, int64, int64[:, ::1])")
-def most_carried(spare: Ints, n: int, vacant: Bytes, goals: Ints, limit: int, most: int, end: Ints) -> int:
-    """Find how many vacancies of the goal rows a batch can fill at most.
-
-    For each number of columns and of atoms so far, ``end`` keeps the least column after the last that is
-    taken: what is carried by then is worth no more if it ends later.
-
-    Args:
-        spare: See the module.
-        n: Number of rows.
-        vacant: See the module.
-        goals: int64 (n,), the goal rows.
-        limit: Maximum number of columns.
-        most: An upper bound of the result.
-        end: Work space, int64 (> limit, > most).
+    The pattern of each source column, -1 if an atom stays in it, int64 (n,); what its atoms to
+    spare gain, float64 (n,); the highest gain with sources before a column, float64 (n + 1,); the last
+    source of that, for each goal, int16 (n, n + 1); the goals, int64 (n,); the gain of each pattern,
+    float64; the costs of the columns, float64 (n,).
     """
-    n_cols = vacant.shape[1]
-    n_wanted = 0
-    for col in range(n_cols):
-        n_wanted += pattern_of(vacant, goals, n, col) != 0
-    step = 1 if n_wanted > limit else 0  # otherwise columns need not be counted
-    for atoms in range(most + 1):
-        end[0, atoms] = NOWHERE
-    end[0, 0] = 0
-    columns = best = 0
-    for col in range(n_cols):
-        wanted = pattern_of(vacant, goals, n, col)
-        if wanted == 0:
-            continue
-        if columns < limit and step == 1:
-            columns += 1
-            for atoms in range(most + 1):
-                end[columns, atoms] = NOWHERE
-        before = best
-        for taken in range(columns - step, -1, -1):
-            for atoms in range(before, -1, -1):
-                start = end[taken, atoms]
-                if start >= n_cols:
-                    continue
-                part = wanted
-                while part > 0:
-                    total = atoms + n_bits(part)
-                    if total <= most:
-                        end[taken + step, total] = min(end[taken + step, total], spare[part, start] + 1)
-                        if total > best and end[taken + step, total] <= n_cols:
-                            best = total
-                    part = (part - 1) & wanted
-        if best == most:
-            break
-    return best
+    return (
+        np.empty(n, np.int64),
+        np.empty(n),
+        np.empty(n + 1),
+        np.empty((n, n + 1), np.int16),
+        np.empty(n, np.int64),
+        np.empty(1 << MAX_ROWS),
+        np.empty(n),
+    )
 
 
-AFTER_ALL: Final = 1 << 14
-Ends = NDArray[np.int16]
+@helper_kernel("int64(int64)")
+def n_bits(pattern: int) -> int:
+    """Count the bits of a pattern of at most 4 rows."""
+    twos = pattern - ((pattern >> 1) & 0x5)
+    return (twos & 0x3) + ((twos >> 2) & 0x3)
 
 
-@helper_kernel()
-def trace_back(
-    spare: Ints, wanted: Ints, n_wanted: int, n_chosen: int, atoms: int, ends: Ends, chosen: Ints
-) -> None:
-    """Read the choice of columns from the finished programme of :func:`trace_columns`, backwards."""
-    k = n_wanted
-    for taken in range(n_chosen, 0, -1):
-        while ends[k - 1, taken, atoms] == ends[k, taken, atoms]:
-            k -= 1
-        k -= 1
-        part = wanted[0, k]
-        while True:
-            before = atoms - n_bits(part)
-            start = ends[k, taken - 1, before] if before >= 0 else AFTER_ALL
-            if start < AFTER_ALL and spare[part, start] + 1 == ends[k + 1, taken, atoms]:
+@helper_kernel(f"void({VIEW}, int64[:, ::1], int64)")
+def read_sources(view: View, rows: Ints, k: int) -> None:
+    """Read the patterns of the source columns, and what their atoms to spare gain."""
+    (source, _, _), _, costs, work = view
+    for col in range(source.shape[1]):
+        pattern, gain = 0, 0.0
+        for i in range(k):
+            atom = source[rows[0, i], col]
+            if atom == STAYS:
+                pattern = -1
                 break
-            part = (part - 1) & wanted[0, k]
-        atoms = before
-        chosen[0, taken - 1], chosen[1, taken - 1] = part, wanted[1, k]
+            pattern |= int(atom != EMPTY) << i
+            gain -= costs[4] if atom == SPARE else 0.0
+        work[0][col], work[1][col] = pattern, gain
 
 
-@helper_kernel("int64(int64[:, ::1], int64, uint8[:, ::1], int64[::1], int64, int64, int64[:, ::1])")
-def trace_columns(
-    spare: Ints, n: int, vacant: Bytes, goals: Ints, limit: int, gain: int, chosen: Ints
-) -> int:
-    """Find a choice of columns that carries ``gain`` atoms, by the programme of :func:`most_carried`.
-
-    Args:
-        spare: See the module.
-        n: Number of rows.
-        vacant: See the module.
-        goals: int64 (n,), the goal rows.
-        limit: Maximum number of columns.
-        gain: What :func:`most_carried` returned.
-        chosen: Result, int64 (>= 2, n_cols): pattern and goal of each column.
+@helper_kernel(f"int64({VIEW}, int64[:, ::1], int64, int64, float64)")
+def read_goal(view: View, rows: Ints, k: int, col: int, price: float) -> int:
+    """Work out what each pattern gains in a goal column, less the ways along columns.
 
     Returns:
-        Number of columns, the fewest that carry as many.
+        The pattern of its vacancies; the gains of other patterns mean nothing.
     """
-    n_cols = vacant.shape[1]
-    wanted = np.empty((2, n_cols), np.int64)
-    n_wanted = 0
-    for col in range(n_cols):
-        wanted[0, n_wanted], wanted[1, n_wanted] = pattern_of(vacant, goals, n, col), col
-        n_wanted += wanted[0, n_wanted] != 0
-    ends = np.empty((n_wanted + 1, limit + 1, gain + 1), np.int16)
-    ends[0] = AFTER_ALL
-    ends[0, 0, 0] = 0
-    for k in range(n_wanted):
-        ends[k + 1] = ends[k]
-        for taken in range(min(limit, k + 1)):
-            for atoms in range(min(gain, n * taken) + 1):
-                start = ends[k, taken, atoms]
-                part = wanted[0, k] if start < n_cols else 0
-                while part > 0:
-                    total = atoms + n_bits(part)
-                    if total <= gain and spare[part, start] + 1 < ends[k + 1, taken + 1, total]:
-                        ends[k + 1, taken + 1, total] = spare[part, start] + 1
-                    part = (part - 1) & wanted[0, k]
-    n_chosen = 0
-    while ends[n_wanted, n_chosen, gain] == AFTER_ALL:
-        n_chosen += 1
-    trace_back(spare, wanted, n_wanted, n_chosen, gain, ends, chosen)
-    return n_chosen
+    (_, vacant, unavoidable), _, costs, work = view
+    vacancies, gains = 0, work[5]
+    gains[0] = 0.0
+    for i in range(k):
+        row = rows[1, i]
+        ways = costs[3] * abs(rows[0, i] - row)
+        gain = price + unavoidable[row, col] - ways
+        for part in range(1 << i):
+            gains[part] -= ways  # of the tweezer
+            gains[part | 1 << i] = gains[part] + gain
+        vacancies |= int(vacant[row, col]) << i
+    return vacancies
 
 
-@helper_kernel("void(int64[:, ::1], int64, int64[:, ::1], int64[:, ::1])")
-def take_nearest(spare: Ints, n_chosen: int, chosen: Ints, cost: Ints) -> None:
-    """Choose source columns near their goals: of least sum of the squares of the ways.
+@helper_kernel(f"int64({VIEW}, int64[:, ::1], int64, float64, int64[:, ::1])")
+def match_columns(view: View, rows: Ints, k: int, price: float, columns: Ints) -> int:
+    """Match source columns with goal columns in order, so that most is gained.
+
+    A dynamic programme over the goals, as for the longest common subsequence: for each column, the most
+    that sources before it can gain.
 
     Args:
-        spare: See the module.
-        n_chosen: Number of columns.
-        chosen: int64 (3, n_cols): pattern and goal of each column; its source is added.
-        cost: Work space, int64 (> n_chosen, > n_cols): of the columns so far, with sources before a column.
+        view: The sites.
+        rows: See the module.
+        k: Number of rows.
+        price: What an atom gains.
+        columns: Result, see the module.
+
+    Returns:
+        Number of columns.
     """
-    n_cols = spare.shape[1] - 1
-    for col in range(n_cols + 1):
-        cost[0, col] = 0
-    for k in range(n_chosen):
-        cost[k + 1, 0] = NOWHERE
-        for col in range(n_cols):
-            cost[k + 1, col + 1] = cost[k + 1, col]
-            if spare[chosen[0, k], col] == col:
-                way = col - chosen[1, k]
-                cost[k + 1, col + 1] = min(cost[k + 1, col + 1], cost[k, col] + way * way)
-    col = n_cols
-    for k in range(n_chosen - 1, -1, -1):
-        while cost[k + 1, col] == cost[k + 1, col - 1]:
-            col -= 1
-        col -= 1
-        chosen[2, k] = col
+    n_cols, band, way = view[0][0].shape[1], view[1][3], view[2][3]
+    patterns, spare, most, last, goals, gains, _ = view[3]
+    read_sources(view, rows, k)
+    most[0] = 0.0
+    filled = n_goals = 0  # ``most`` is known up to this column
+    for goal in range(n_cols):
+        vacancies = read_goal(view, rows, k, goal, price)
+        if vacancies == 0:
+            continue
+        low, high = max(0, goal - band), min(n_cols - 1, goal + band)
+        while filled <= high:
+            filled += 1
+            most[filled] = most[filled - 1]
+        for col in range(high, low - 1, -1):
+            last[n_goals, col + 1] = -1
+            pattern = patterns[col]
+            if pattern <= 0 or pattern & ~vacancies:
+                continue
+            gain = gains[pattern] + spare[col] - way * abs(col - goal) * (k + n_bits(pattern))
+            if most[col] + gain > most[col + 1] + TOLERANCE:
+                most[col + 1] = most[col] + gain
+                last[n_goals, col + 1] = col
+        for col in range(low + 1, high + 1):
+            if most[col] > most[col + 1]:
+                most[col + 1], last[n_goals, col + 1] = most[col], last[n_goals, col]
+        goals[n_goals] = goal
+        n_goals += 1
+    return trace_columns(view, n_goals, columns)
+
+
+@helper_kernel(f"int64({VIEW}, int64, int64[:, ::1])")
+def trace_columns(view: View, n_goals: int, columns: Ints) -> int:
+    """Read the columns from the finished programme of :func:`match_columns`, backwards."""
+    n_cols, band = view[0][0].shape[1], view[1][3]
+    patterns, _, _, last, goals, _, _ = view[3]
+    n, end = 0, n_cols
+    for i in range(n_goals - 1, -1, -1):
+        low, high = goals[i] - band, min(n_cols - 1, goals[i] + band)
+        end = min(end, high + 1)
+        if end > max(0, low) and last[i, end] >= 0:
+            end = int(last[i, end])
+            columns[0, n], columns[1, n], columns[2, n] = patterns[end], goals[i], end
+            n += 1
+    for j in range(n // 2):
+        for i in range(3):
+            columns[i, j], columns[i, n - 1 - j] = columns[i, n - 1 - j], columns[i, j]
+    return n
+
+
+@helper_kernel(f"void({VIEW}, int64[:, ::1], int64, int64[:, ::1], int64)")
+def find_costs(view: View, rows: Ints, k: int, columns: Ints, n: int) -> None:
+    """Find the costs of columns: their passes, less those of ways that cannot be avoided."""
+    unavoidable, costs, spare, cost = view[0][2], view[2], view[3][1], view[3][6]
+    for j in range(n):
+        pattern, goal, source = columns[0, j], columns[1, j], columns[2, j]
+        cost[j] = -spare[source]
+        for i in range(k):
+            ways = costs[3] * (abs(goal - source) + abs(rows[0, i] - rows[1, i]))
+            cost[j] += ways
+            if pattern >> i & 1:
+                cost[j] += ways - unavoidable[rows[1, i], goal]
+
+
+@helper_kernel(f"boolean({VIEW}, int64[:, ::1], int64, int64[:, ::1], int64)")
+def lands_on_atom(view: View, rows: Ints, k: int, columns: Ints, j: int) -> bool:
+    """Whether a tweezer of a column without an atom would end on one."""
+    for i in range(k):
+        if not columns[0, j] >> i & 1 and view[0][0][rows[1, i], columns[1, j]] != EMPTY:
+            return True
+    return False
+
+
+@helper_kernel("void(float64[::1], int64[:, ::1], int64, int64[::1])")
+def sort_columns(cost: Floats, columns: Ints, n: int, order: Ints) -> None:
+    """List columns in order of their costs per atom."""
+    for j in range(n):
+        place = j
+        while place > 0:
+            before = order[place - 1]
+            if cost[before] * n_bits(columns[0, j]) <= cost[j] * n_bits(columns[0, before]) + TOLERANCE:
+                break
+            order[place] = before
+            place -= 1
+        order[place] = j
+
+
+@helper_kernel(f"Tuple((float64, int64))({VIEW}, int64[:, ::1], int64, int64[:, ::1], int64)")
+def cut_columns(view: View, rows: Ints, k: int, columns: Ints, n: int) -> tuple[float, int]:
+    """Keep those of some columns that cost least per atom, as many as limits allow.
+
+    Returns:
+        The cost per atom, and the number of columns.
+    """
+    _, limits, costs, work = view
+    limit, cost, order = min(limits[0] // k, limits[2]), work[6], np.empty(n, np.int64)
+    find_costs(view, rows, k, columns, n)
+    sort_columns(cost, columns, n, order)
+    down = furthest = 0
+    for i in range(k):
+        down = max(down, abs(rows[0, i] - rows[1, i]))
+    for j in range(n):
+        furthest = max(furthest, abs(columns[1, j] - columns[2, j]))
+    least, longest, n_kept = np.inf, 0, 0
+    for across in range(furthest + 1):
+        total, atoms, taken, in_stages = costs[0] + costs[1] * (down + across), 0, 0, k == 1
+        for place in range(n):
+            j = order[place]
+            if abs(columns[1, j] - columns[2, j]) > across:
+                continue
+            if taken == limit:
+                break
+            if not in_stages and lands_on_atom(view, rows, k, columns, j):
+                in_stages = True
+                total += (k - 1) * costs[2]
+            taken += 1
+            atoms += n_bits(columns[0, j])
+            total += cost[j]
+            if total < atoms * least - TOLERANCE:
+                least, longest, n_kept = float(total / atoms), across, taken
+    return least, keep_columns(order, longest, n_kept, columns, n)
+
+
+@helper_kernel("int64(int64[::1], int64, int64, int64[:, ::1], int64)")
+def keep_columns(order: Ints, longest: int, n_kept: int, columns: Ints, n: int) -> int:
+    """Keep the first ``n_kept`` columns of an order whose ways are no longer than ``longest``."""
+    kept = np.zeros(n, np.bool_)
+    for place in range(n):
+        j = order[place]
+        if n_kept > 0 and abs(columns[1, j] - columns[2, j]) <= longest:
+            kept[j] = True
+            n_kept -= 1
+    m = 0
+    for j in range(n):
+        if kept[j]:
+            for i in range(3):
+                columns[i, m] = columns[i, j]
+            m += 1
+    return m
+
+
+@helper_kernel(f"Tuple((float64, int64))({VIEW}, int64[:, ::1], int64, float64, int64[:, ::1])")
+def choose_columns(view: View, rows: Ints, k: int, price: float, columns: Ints) -> tuple[float, int]:
+    """Choose the columns that cost least per atom, if that is less than ``price``.
+
+    Returns:
+        The cost per atom, inf if there is no such choice; the number of columns.
+    """
+    n = match_columns(view, rows, k, price, columns)
+    if n == 0:
+        return np.inf, 0
+    return cut_columns(view, rows, k, columns, n)

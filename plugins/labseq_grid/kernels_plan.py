@@ -10,109 +10,35 @@ from numpy.typing import NDArray
 from labseq.plugin import const, helper_kernel, kernel
 from labseq.plugin.plan_kernels import GROWING_PLAN, GrowingPlan, add_move, empty_plan, end_batch, finished
 from labseq_grid.kernels_columns import (
+    COSTS,
     EMPTY,
     SPARE,
     STAYS,
+    UNWANTED,
     Bytes,
+    Costs,
     Ints,
-    find_spare,
-    take_nearest,
-    trace_columns,
+    Limits,
+    View,
+    workspace,
 )
 from labseq_grid.kernels_paths import Bools, Floats, find_paths, max_knots
-from labseq_grid.kernels_rows import (
-    ATOMS,
-    CANDIDATE,
-    FROM,
-    MAX_ROWS,
-    N_KEPT,
-    N_ROWS,
-    ORIENTATION,
-    SLACK,
-    TO,
-    Candidates,
-    try_rows,
-)
+from labseq_grid.kernels_rows import BAND, Batch, State, best_batch, find_nearest, make_pairs
 
-UNWANTED: Final = 3
-"""An atom on a site that must be empty; elsewhere an atom is SPARE or STAYS."""
-SCATTER: Final = 3.0
-"""Weight of the vacancies that are left, against one atom carried."""
-WAY: Final = 0.05
-"""Weight of one site of an atom's way: on long ways tweezers pass many atoms."""
-COMPARED_SITES: Final = 2000
-"""Number of sites up to which all candidates that are kept are compared; above, fewer."""
-LEAST_COMPARED: Final = 6
 GRID: Final = const("bool_", 2)
 
-Limits = tuple[int, int, int]
-"""Maximum number of tweezers, row tones and column tones."""
-Machine = tuple[Limits, int, bool, float]
-"""Limits; lines beyond the grid that the tones reach on each side; whether a tweezer without an atom may be
-ramped down on an atom; how far lanes swing, see :func:`labseq_grid.kernels_paths.add_travel`."""
-MACHINE: Final = "Tuple((UniTuple(int64, 3), int64, boolean, float64))"
+Machine = tuple[tuple[int, int, int], int, bool, float, Costs]
+"""Maximum number of tweezers, row tones and column tones; lines beyond the grid that the tones reach on each
+side; whether a tweezer without an atom may be ramped down on an atom; how far lanes swing, see
+:func:`labseq_grid.kernels_paths.add_travel`; expected losses."""
+MACHINE: Final = f"Tuple((UniTuple(int64, 3), int64, boolean, float64, {COSTS}))"
 Sites = tuple[Bytes, Bytes, int]
 """What each site holds (EMPTY, SPARE, STAYS or UNWANTED), and where an atom may be dropped off, both uint8;
 and how many lines outside of the grid they have on each side."""
 SITES: Final = "Tuple((uint8[:, ::1], uint8[:, ::1], int64))"
-Batch = tuple[int, Ints, Ints]
-"""Orientation; source and goal rows, int64 (2, n); pattern, goal and source of each column, int64 (3, m)."""
 Paths = tuple[NDArray[np.int32], Floats, NDArray[np.int32], int, int]
 """path_shapes, path_positions and path_off of :class:`labseq.plugin.Plan`; how many of the last two."""
 PATHS: Final = "Tuple((int32[:, ::1], float64[::1], int32[::1], int64, int64))"
-
-
-@helper_kernel()
-def column_limit(limits: Limits, n: int, swapped: int, n_lines: int) -> int:
-    """Maximum number of columns of a batch of ``n`` rows; a lane needs one line of ``n_lines`` free."""
-    tones = limits[1] if swapped else limits[2]
-    return min(limits[0] // n, tones, n_lines)
-
-
-@helper_kernel()
-def row_limit(limits: Limits, swapped: int, n_lines: int) -> int:
-    """Maximum number of rows of a batch."""
-    tones = limits[2] if swapped else limits[1]
-    return min(limits[0], tones, n_lines)
-
-
-@helper_kernel()
-def find_candidates(source: Bytes, vacant: Bytes, limits: Limits, spread: int, n_left: int) -> Candidates:
-    """Find the best candidates of both orientations.
-
-    ``spread`` is the number of lines that tones reach outside of ``source``, less one, for lanes.
-    """
-    candidates = np.empty((N_KEPT, CANDIDATE), np.int64), 0
-    source_swapped, vacant_swapped = source.T.copy(), vacant.T.copy()
-    lines, across = source.shape
-    for n in range(min(MAX_ROWS, n_left), 0, -1):
-        for swapped in range(2):
-            n_rows = (across if swapped else lines) + spread
-            n_cols = (lines if swapped else across) + spread
-            limit = min(column_limit(limits, n, swapped, n_cols), n_left)
-            if limit < 1 or n > row_limit(limits, swapped, n_rows):
-                continue
-            if swapped:
-                candidates = try_rows(candidates, source_swapped, vacant_swapped, n, limit, 1, n_left)
-            else:
-                candidates = try_rows(candidates, source, vacant, n, limit, 0, n_left)
-    return candidates
-
-
-@helper_kernel()
-def complete(source: Bytes, vacant: Bytes, limits: Limits, n_lines: int, candidate: Ints) -> Batch:
-    """Choose the columns of a candidate; ``source`` and ``vacant`` are in its orientation."""
-    n, swapped, atoms = candidate[N_ROWS], candidate[ORIENTATION], candidate[ATOMS]
-    n_cols = source.shape[1]
-    rows = np.empty((2, n), np.int64)
-    rows[0], rows[1] = candidate[FROM : FROM + n], candidate[TO : TO + n]
-    limit = min(column_limit(limits, n, swapped, n_lines), atoms)
-    spare = np.empty((1 << n, n_cols + 1), np.int64)
-    find_spare(source, rows[0], n, spare)
-    columns = np.empty((3, n_cols), np.int64)
-    m = trace_columns(spare, n, vacant, rows[1], limit, atoms, columns)
-    take_nearest(spare, m, columns, np.empty((m + 1, n_cols + 1), np.int64))
-    return swapped, rows, columns[:, :m].copy()
 
 
 @helper_kernel()
@@ -132,80 +58,10 @@ def list_moves(batch: Batch) -> Ints:
 
 
 @helper_kernel()
-def scatter(marks: Bytes) -> float:
-    """How scattered marked sites are: each counts one over the number of them in its row or column."""
-    n_rows, n_cols = marks.shape
-    in_row, in_column = np.zeros(n_rows, np.int64), np.zeros(n_cols, np.int64)
-    for row in range(n_rows):
-        for col in range(n_cols):
-            in_row[row] += marks[row, col]
-            in_column[col] += marks[row, col]
-    total = 0.0
-    for row in range(n_rows):
-        for col in range(n_cols):
-            if marks[row, col]:
-                total += 1.0 / max(in_row[row], in_column[col])
-    return total
-
-
-@helper_kernel()
-def worth(sites: Sites, moves: Ints, fills: bool) -> float:
-    """Worth of a batch: atoms carried, less their ways and the scatter of what it leaves.
-
-    It leaves vacancies if the batch ``fills``, else unwanted atoms.
-    """
-    kind, vacant, _ = sites
-    marks = vacant.copy() if fills else (kind == UNWANTED).astype(np.uint8)
-    side = 2 if fills else 0
-    way, total = 0, float(len(moves))
-    for i in range(len(moves)):
-        total += kind[moves[i, 0], moves[i, 1]] == UNWANTED
-        marks[moves[i, side], moves[i, side + 1]] = 0
-        way += abs(moves[i, 2] - moves[i, 0]) + abs(moves[i, 3] - moves[i, 1])
-    return total - SCATTER * scatter(marks) - WAY * way
-
-
-@helper_kernel()
-def find_sources(kind: Bytes, fills: bool, only_unwanted: bool, source: Bytes) -> None:
-    """Mark atoms that may be carried as SPARE and the others as STAYS."""
-    for row in range(kind.shape[0]):
-        for col in range(kind.shape[1]):
-            atom = kind[row, col]
-            spare = atom == UNWANTED or (atom == SPARE and fills and not only_unwanted)
-            source[row, col] = EMPTY if atom == EMPTY else SPARE if spare else STAYS
-
-
-@helper_kernel()
-def best_batch(sites: Sites, machine: Machine, fills: bool, n_left: int) -> Batch:
-    """Compare the candidates that carry most atoms, at most ``n_left``; no columns if none carries any."""
-    kind, vacant, n_beside = sites
-    limits, slots, _, _ = machine
-    source = np.empty_like(kind)
-    spread = 2 * (slots - n_beside) - 1
-    n_compared = max(LEAST_COMPARED, N_KEPT * COMPARED_SITES // kind.size)
-    best, most = (0, np.empty((2, 0), np.int64), np.empty((3, 0), np.int64)), -1e300
-    for only_unwanted in range(2 if fills and (kind == UNWANTED).any() else 1):
-        find_sources(kind, fills, only_unwanted == 1, source)
-        kept, n_kept = find_candidates(source, vacant, limits, spread, n_left)
-        source_swapped, vacant_swapped = source.T.copy(), vacant.T.copy()
-        for i in range(min(n_kept, n_compared)):
-            if kept[i, ATOMS] < kept[0, ATOMS] - SLACK:
-                break
-            if kept[i, ORIENTATION]:
-                batch = complete(source_swapped, vacant_swapped, limits, kind.shape[0] + spread, kept[i])
-            else:
-                batch = complete(source, vacant, limits, kind.shape[1] + spread, kept[i])
-            value = worth(sites, list_moves(batch), fills)
-            if value > most:
-                best, most = batch, value
-    return best
-
-
-@helper_kernel()
 def paths_of(sites: Sites, machine: Machine, batch: Batch) -> tuple[Floats, Floats, Ints]:
     """Find the paths of a batch's tones, see :func:`labseq_grid.kernels_paths.find_paths`."""
     kind, _, n_beside = sites
-    _, slots, may_land, weave = machine
+    _, slots, may_land, weave, _ = machine
     swapped, rows, columns = batch
     used = np.zeros(rows.shape[1], np.bool_)  # a row of which no column takes an atom needs no tone
     for i in range(len(used)):
@@ -258,33 +114,96 @@ def add_batch(
 
 
 @helper_kernel()
-def carry_out(sites: Sites, moves: Ints) -> None:
-    """Update the sites after a batch."""
+def distances(source: Bytes) -> Floats:
+    """Distance of each site from the nearest atom that may be taken, along rows and columns."""
+    n_rows, n_cols = source.shape
+    away = np.empty((n_rows, n_cols))
+    for row in range(n_rows):
+        for col in range(n_cols):
+            atom = source[row, col]
+            away[row, col] = 0.0 if atom in (SPARE, UNWANTED) else n_rows + n_cols
+            if row > 0:
+                away[row, col] = min(away[row, col], away[row - 1, col] + 1.0)
+            if col > 0:
+                away[row, col] = min(away[row, col], away[row, col - 1] + 1.0)
+    for row in range(n_rows - 1, -1, -1):
+        for col in range(n_cols - 1, -1, -1):
+            if row + 1 < n_rows:
+                away[row, col] = min(away[row, col], away[row + 1, col] + 1.0)
+            if col + 1 < n_cols:
+                away[row, col] = min(away[row, col], away[row, col + 1] + 1.0)
+    return away
+
+
+@helper_kernel()
+def view_of(kind: Bytes, vacant: Bytes, unavoidable: Floats, limits: Limits, costs: Costs) -> View:
+    """One orientation of the grid."""
+    return (kind, vacant, unavoidable), limits, costs, workspace(max(kind.shape))
+
+
+@helper_kernel()
+def state_of(sites: Sites, machine: Machine, fills: bool, band: int) -> State:
+    """The state before the first batch; sources are all atoms to spare if batches fill vacancies."""
+    kind, vacant, n_beside = sites
+    limits, slots, _, _, costs = machine
+    spread = 2 * (slots - n_beside) - 1  # a lane needs one line free
+    n_rows, n_cols = min(limits[1], kind.shape[0] + spread), min(limits[2], kind.shape[1] + spread)
+    source, unavoidable = kind.copy(), np.zeros(kind.shape)
+    if fills:
+        unavoidable = 2.0 * costs[3] * distances(kind)
+    else:
+        source[:] = np.where(kind == SPARE, STAYS, kind)
+    as_is = view_of(source, vacant.copy(), unavoidable, (limits[0], n_rows, n_cols, band), costs)
+    swapped_limits = limits[0], n_cols, n_rows, band
+    swapped = view_of(source.T.copy(), vacant.T.copy(), unavoidable.T.copy(), swapped_limits, costs)
+    return (as_is, make_pairs(as_is)), (swapped, make_pairs(swapped))
+
+
+@helper_kernel()
+def carry_out(sites: Sites, state: State, moves: Ints, number: int) -> None:
+    """Update the sites, and the state, after a batch."""
     kind, vacant, n_beside = sites
     n_rows, n_cols = kind.shape
     for i in range(len(moves)):
-        row, col = moves[i, 2], moves[i, 3]
-        kind[moves[i, 0], moves[i, 1]] = EMPTY
-        if n_beside <= row < n_rows - n_beside and n_beside <= col < n_cols - n_beside:
-            kind[row, col] = STAYS
-            vacant[row, col] = 0
+        from_row, from_col, row, col = moves[i]
+        stays = n_beside <= row < n_rows - n_beside and n_beside <= col < n_cols - n_beside
+        kind[from_row, from_col] = EMPTY
+        if stays:
+            kind[row, col], vacant[row, col] = STAYS, 0
+        for a in range(2):
+            view, pairs = state[a]
+            source, goals, _ = view[0]
+            at, to = ((from_col, from_row), (col, row)) if a else ((from_row, from_col), (row, col))
+            source[at] = EMPTY
+            if stays:
+                source[to], goals[to] = STAYS, 0
+            pairs[3][0, at[0]] = pairs[3][1, to[0]] = number
+    for a in range(2):
+        view, pairs = state[a]
+        for row in range(len(pairs[2])):
+            if pairs[3][0, row] == number:
+                find_nearest(view[0][0], row, pairs[4])
 
 
-@helper_kernel(
-    f"Tuple(({GROWING_PLAN}, {PATHS}))({GROWING_PLAN}, {PATHS}, {SITES}, {MACHINE}, boolean, int64)"
-)
+@helper_kernel(f"Tuple(({GROWING_PLAN}, {PATHS}))({GROWING_PLAN}, {PATHS}, {SITES}, {MACHINE}, boolean)")
 def add_batches(
-    plan: GrowingPlan, paths: Paths, sites: Sites, machine: Machine, fills: bool, n_left: int
+    plan: GrowingPlan, paths: Paths, sites: Sites, machine: Machine, fills: bool
 ) -> tuple[GrowingPlan, Paths]:
-    """Add batches until ``n_left`` atoms have been carried, or no more can be; updates ``sites``."""
-    while n_left > 0:
-        batch = best_batch(sites, machine, fills, n_left)
-        if batch[2].shape[1] == 0:
+    """Add batches until no more atoms can be carried; updates ``sites``."""
+    widest, number = max(sites[0].shape), -1
+    band = min(BAND, widest)
+    state = state_of(sites, machine, fills, band)
+    while sites[1].any():
+        number += 1
+        batch = best_batch(state, number)
+        if batch[2].shape[1] > 0:
+            plan, paths = add_batch(plan, paths, sites, machine, batch)
+            carry_out(sites, state, list_moves(batch), number)
+        elif band < widest:  # sources that are left may be further away
+            band = widest
+            state = state_of(sites, machine, fills, band)
+        else:
             break
-        plan, paths = add_batch(plan, paths, sites, machine, batch)
-        moves = list_moves(batch)
-        carry_out(sites, moves)
-        n_left -= len(moves)
     return plan, paths
 
 
@@ -357,14 +276,12 @@ def plan_grid(
         0,
         0,
     )
-    plan, paths = add_batches(plan, paths, sites, machine, True, n_vacant)
+    plan, paths = add_batches(plan, paths, sites, machine, True)
     if n_unwanted > 0:
         open_reservoir(sites, wanted | clear)
-        n_left = int(np.count_nonzero(sites[0] == UNWANTED))
-        plan, paths = add_batches(plan, paths, sites, machine, False, n_left)
+        plan, paths = add_batches(plan, paths, sites, machine, False)
         open_outside(sites)
-        n_left = int(np.count_nonzero(sites[0] == UNWANTED))
-        plan, paths = add_batches(plan, paths, sites, machine, False, n_left)
+        plan, paths = add_batches(plan, paths, sites, machine, False)
     moves, offsets, linked = finished(plan)
     shapes, positions, off, n_positions, n_off = paths
     path_arrays = shapes[: plan[3]].copy(), positions[:n_positions].copy(), off[:n_off].copy()

@@ -1,9 +1,9 @@
 """Kernels that choose the rows of a batch.
 
-Any choice of up to three goal rows bounds what a batch to them can carry, whatever its source rows: the
-vacancies in the columns with most of them. From the highest bound on, each is tried with all choices of
-as many source rows, of those with most spare atoms, until no bound is above what has been found.
-A *candidate* is int64: atoms carried, orientation, number of rows, source rows, goal rows.
+The *cost* of a batch is the number of atoms that it is expected to lose, for each vacancy that it fills. It
+is estimated for all pairs of a source row and a goal row, in both orientations, and worked out for those of
+lowest cost. As sites are used up, a cost only rises: so a pair is worked out again only when it comes
+first. From the best pairs on, rows are added while the cost falls.
 """
 
 from __future__ import annotations
@@ -14,218 +14,259 @@ import numpy as np
 
 from labseq.plugin import helper_kernel
 from labseq_grid.kernels_columns import (
+    MAX_ROWS,
     SPARE,
+    TOLERANCE,
+    UNWANTED,
+    VIEW,
     Bytes,
+    Floats,
     Ints,
-    find_spare,
-    most_carried,
+    View,
+    choose_columns,
 )
 
-MAX_ROWS: Final = 3
-"""Maximum number of rows of a batch."""
-SOURCE_ROWS: Final = 5
-"""Number of source rows that are considered: those with most spare atoms."""
-FEW: Final = 3
-"""So few atoms are few: more source rows are considered, for all to be carried in one batch."""
-SOURCE_ROWS_OF_FEW: Final = 12
-GOAL_ROWS: Final = 22
-"""Number of goal rows that are considered for three rows; for two rows three times as many."""
-TRIALS: Final = 100
-"""Maximum number of pairs of choices that are tried for each number of rows."""
-WORK: Final = 4_000_000
-"""Fewer are tried of large grids: so many steps of the programmes for the columns, about."""
-N_KEPT: Final = 16
-"""Number of candidates that are kept."""
-SLACK: Final = 2
-"""A candidate is kept if it carries at most so many atoms fewer than the best."""
+STARTS: Final = 3
+"""Number of pairs of rows to which others are added."""
+BAND: Final = 10
+"""Sources are no more columns from their goals, unless nothing else is left."""
+NEAR: Final = 4
+"""Rows that are added are no further from the source rows."""
+APART: Final = 1
+"""Ways of rows that are added differ by no more from that of the first row."""
+DEAREST: Final = 2.0
+"""A pair of rows that costs more than this many times as much as the batch is not added to it."""
+RISE: Final = 1.3
+"""Prices rise by this factor while there is nothing at the price."""
 
-ATOMS: Final = 0
-ORIENTATION: Final = 1
-N_ROWS: Final = 2
-FROM: Final = 3
-TO: Final = FROM + MAX_ROWS
-CANDIDATE: Final = TO + MAX_ROWS
+NOWHERE: Final = 1 << 20
+"""Distance where there is no atom."""
 
-Candidates = tuple[Ints, int]
-"""int64 (N_KEPT, CANDIDATE), the candidates, the best first; and how many there are."""
-CANDIDATES: Final = "Tuple((int64[:, ::1], int64))"
-
-
-@helper_kernel()
-def count_sites(sites: Bytes, value: int, counts: Ints) -> None:
-    """Count the sites of a value in each row."""
-    for row in range(sites.shape[0]):
-        counts[row] = 0
-        for col in range(sites.shape[1]):
-            counts[row] += sites[row, col] == value
+Pairs = tuple[Floats, Ints, Floats, Ints, Ints]
+"""Pairs of rows of one orientation: cost, float64 (n_rows, n_rows), by source and goal; when it was found,
+int64, the same shape, see :func:`find_starts`; lowest cost for each source, float64 (n_rows,); number of the
+batch by which sources and vacancies of each row last changed, int64 (2, n_rows); distances of
+:func:`find_nearest`, int64 (n_rows, n_cols)."""
+PAIRS: Final = "Tuple((float64[:, ::1], int64[:, ::1], float64[::1], int64[:, ::1], int64[:, ::1]))"
+Batch = tuple[int, Ints, Ints]
+"""Orientation; source and goal rows, int64 (2, k); pattern, goal and source of each column, int64 (3, m)."""
+State = tuple[tuple[View, Pairs], tuple[View, Pairs]]
+"""The grid and its pairs of rows, in both orientations."""
+STATE: Final = f"UniTuple(Tuple(({VIEW}, {PAIRS})), 2)"
+BATCH: Final = "Tuple((int64, int64[:, ::1], int64[:, ::1]))"
 
 
-@helper_kernel()
-def n_choices(n_rows: int, n: int) -> int:
-    """Number of choices of ``n`` of ``n_rows`` rows, n up to 3."""
-    if n == 1:
-        return n_rows
-    if n == 2:
-        return n_rows * (n_rows - 1) // 2
-    return n_rows * (n_rows - 1) * (n_rows - 2) // 6
+@helper_kernel("void(uint8[:, ::1], int64, int64[:, ::1])")
+def find_nearest(source: Bytes, row: int, nearest: Ints) -> None:
+    """Distance of each column of a row from the nearest atom of the row that may be taken."""
+    n_cols = source.shape[1]
+    away = NOWHERE
+    for col in range(n_cols):
+        away = 0 if source[row, col] in (SPARE, UNWANTED) else away + 1
+        nearest[row, col] = away
+    away = NOWHERE
+    for col in range(n_cols - 1, -1, -1):
+        away = 0 if nearest[row, col] == 0 else away + 1
+        nearest[row, col] = min(nearest[row, col], away)
 
 
-@helper_kernel()
-def richest_rows(counts: Ints, n_most: int, rows: Ints) -> int:
-    """List the rows with the highest counts above 0, in ascending order; return how many."""
+@helper_kernel(f"float64({VIEW}, int64, int64, int64[:, ::1])")
+def estimate(view: View, row: int, to: int, nearest: Ints) -> float:
+    """Estimate the cost of a pair of rows as if each vacancy could have the atom that is nearest."""
+    (_, vacant, unavoidable), limits, costs, work = view
+    n, passes = work[0], work[1]
+    down, limit, furthest = abs(row - to), min(limits[0], limits[2]), -1
+    for col in range(vacant.shape[1]):
+        away = nearest[row, col]
+        if vacant[to, col] and away <= limits[3]:
+            while furthest < away:
+                furthest += 1
+                n[furthest], passes[furthest] = 0, 0.0
+            n[away] += 1
+            passes[away] += 2.0 * costs[3] * (down + away) - unavoidable[to, col]
+    least, total, atoms = np.inf, 0.0, 0
+    for away in range(furthest + 1):
+        atoms += n[away]
+        total += passes[away]
+        if atoms > 0:
+            moving = costs[0] + costs[1] * (down + away)
+            least = min(least, moving / min(atoms, limit) + total / atoms)
+    return least
+
+
+@helper_kernel(f"{PAIRS}({VIEW})")
+def make_pairs(view: View) -> Pairs:
+    """Estimate the costs of all pairs of rows."""
+    source = view[0][0]
+    n_rows, n_cols = source.shape
+    cost, when = np.empty((n_rows, n_rows)), np.zeros((n_rows, n_rows), np.int64)
+    least, nearest = np.empty(n_rows), np.empty((n_rows, n_cols), np.int64)
+    pairs = cost, when, least, np.full((2, n_rows), -1), nearest
+    for row in range(n_rows):
+        find_nearest(source, row, nearest)
+        least[row] = np.inf
+        for to in range(n_rows):
+            cost[row, to] = estimate(view, row, to, nearest)
+            least[row] = min(least[row], cost[row, to])
+    return pairs
+
+
+@helper_kernel(f"void({PAIRS}, int64, int64, float64)")
+def set_cost(pairs: Pairs, row: int, to: int, value: float) -> None:
+    """Set the cost of a pair."""
+    cost, _, least, _, _ = pairs
+    cost[row, to] = value
+    least[row] = np.inf
+    for other in range(len(least)):
+        least[row] = min(least[row], cost[row, other])
+
+
+@helper_kernel(f"Tuple((float64, int64, int64))({VIEW}, {PAIRS}, int64[:, ::1], float64, int64[:, ::1])")
+def add_rows(view: View, pairs: Pairs, rows: Ints, price: float, columns: Ints) -> tuple[float, int, int]:
+    """Choose the columns of a pair of rows, and add rows while the cost falls.
+
+    Returns:
+        The cost, and the numbers of rows and columns.
+    """
+    limits, n_rows = view[1], len(pairs[2])
+    cost, m = choose_columns(view, rows, 1, price, columns)
+    trial, best_rows = np.empty_like(rows), np.empty_like(rows)
+    more = np.empty_like(columns)
+    k, way = 1, rows[1, 0] - rows[0, 0]
+    while m > 0 and k < min(MAX_ROWS, limits[1], limits[0]):
+        before = cost
+        low, high = max(0, rows[0, 0] - NEAR), min(n_rows, rows[0, k - 1] + NEAR + 1)
+        for row in range(low, high):
+            for to in range(max(0, row + way - APART), min(n_rows, row + way + APART + 1)):
+                if pairs[0][row, to] > DEAREST * cost or not insert_row(rows, k, row, to, trial):
+                    continue
+                value, n = choose_columns(view, trial, k + 1, cost, more)
+                if value < cost - TOLERANCE:
+                    cost, m = value, n
+                    copy_columns(more, n, columns)
+                    copy_columns(trial, k + 1, best_rows)
+        if cost == before:
+            break
+        k += 1
+        copy_columns(best_rows, k, rows)
+    return cost, k, m
+
+
+@helper_kernel("void(int64[:, ::1], int64, int64[:, ::1])")
+def copy_columns(columns: Ints, n: int, to: Ints) -> None:
+    """Copy the first ``n`` columns."""
+    for i in range(len(columns)):
+        for j in range(n):
+            to[i, j] = columns[i, j]
+
+
+@helper_kernel("boolean(int64[:, ::1], int64, int64, int64, int64[:, ::1])")
+def insert_row(rows: Ints, k: int, row: int, to: int, longer: Ints) -> bool:
+    """Insert a source row and its goal row, unless the order of the ``k`` others forbids it."""
+    place = 0
+    while place < k and rows[0, place] < row:
+        place += 1
+    for i in range(place):
+        longer[0, i], longer[1, i] = rows[0, i], rows[1, i]
+    longer[0, place], longer[1, place] = row, to
+    for i in range(place, k):
+        longer[0, i + 1], longer[1, i + 1] = rows[0, i], rows[1, i]
+    above = place == 0 or rows[1, place - 1] < to
+    return above and (place == k or (rows[0, place] > row and rows[1, place] > to))
+
+
+@helper_kernel(f"float64({VIEW}, {PAIRS}, int64, int64, int64, int64[:, ::1])")
+def update_cost(view: View, pairs: Pairs, number: int, row: int, to: int, columns: Ints) -> float:
+    """Work out the cost of a pair of rows more precisely, in as many steps as it takes to be lowest.
+
+    First it is estimated, then columns are chosen, at prices that rise until there is a choice.
+    """
+    cost, when, _, changed, nearest = pairs
+    before, now = cost[row, to], 2 * number
+    if when[row, to] < 2 * (max(changed[0, row], changed[1, to]) + 1):
+        when[row, to] = now
+        return max(before, estimate(view, row, to, nearest))
+    rows = np.empty((2, 1), np.int64)
+    rows[0, 0], rows[1, 0] = row, to
+    price = RISE * before
+    value, n = choose_columns(view, rows, 1, price, columns)
+    if n == 0:
+        return price
+    when[row, to] = now + 1
+    return value
+
+
+@helper_kernel("int64(float64[::1])")
+def lowest(values: Floats) -> int:
+    """The index of the lowest value, the first of several."""
+    index = 0
+    for i in range(1, len(values)):
+        if values[i] < values[index]:
+            index = i
+    return index
+
+
+@helper_kernel(f"int64({STATE}, int64, int64[:, ::1])")
+def find_starts(state: State, number: int, starts: Ints) -> int:
+    """Find the pairs of rows of lowest cost.
+
+    A cost that was estimated before batch i is marked with 2 i, one that was worked out with 2 i + 1. It
+    holds until a site of the two rows changes.
+
+    Args:
+        state: The state before the batch.
+        number: Number of the batch.
+        starts: Result, int64 (n, 3): orientation, source row and goal row.
+
+    Returns:
+        How many are found.
+    """
+    columns, found = np.empty((3, len(state[0][0][3][0])), np.int64), np.empty(len(starts))
     n = 0
-    for row in range(len(counts)):
-        if counts[row] == 0:
-            continue
-        if n == n_most:
-            poorest = 0
-            for i in range(1, n):
-                if counts[rows[i]] <= counts[rows[poorest]]:
-                    poorest = i
-            if counts[row] <= counts[rows[poorest]]:
-                continue
-            n -= 1
-            for i in range(poorest, n):
-                rows[i] = rows[i + 1]
-        rows[n] = row
-        n += 1
+    while n < len(starts):
+        row, other = lowest(state[0][1][2]), lowest(state[1][1][2])
+        a = 0 if state[0][1][2][row] <= state[1][1][2][other] else 1
+        if a == 1:
+            row = other
+        view, pairs = state[a]
+        cost, when, _, changed, _ = pairs
+        to = lowest(cost[row])
+        if cost[row, to] == np.inf:
+            break
+        if when[row, to] % 2 == 1 and when[row, to] // 2 > max(changed[0, row], changed[1, to]):
+            starts[n, 0], starts[n, 1], starts[n, 2], found[n] = a, row, to, cost[row, to]
+            set_cost(pairs, row, to, np.inf)  # until all are found
+            n += 1
+        else:
+            set_cost(pairs, row, to, update_cost(view, pairs, number, row, to, columns))
+    for i in range(n):
+        set_cost(state[starts[i, 0]][1], starts[i, 1], starts[i, 2], found[i])
     return n
 
 
-@helper_kernel()
-def choices(rows: Ints, n_rows: int, n: int, chosen: Ints) -> int:
-    """List all choices of ``n`` of some rows, n up to 3, in ``chosen``; return how many."""
-    count = 0
-    for i in range(n_rows):
-        if n == 1:
-            chosen[count, 0] = rows[i]
-            count += 1
-            continue
-        for j in range(i + 1, n_rows):
-            if n == 2:
-                chosen[count, 0], chosen[count, 1] = rows[i], rows[j]
-                count += 1
-                continue
-            for k in range(j + 1, n_rows):
-                chosen[count, 0], chosen[count, 1], chosen[count, 2] = rows[i], rows[j], rows[k]
-                count += 1
-    return count
-
-
-@helper_kernel()
-def bound(sites: Bytes, rows: Ints, n: int, limit: int, value: int) -> int:
-    """Count the sites of a value in up to 3 rows, in the ``limit`` columns with most of them."""
-    n_cols = sites.shape[1]
-    one = two = three = 0
-    if n == 1:
-        for col in range(n_cols):
-            one += sites[rows[0], col] == value
-    elif n == 2:
-        for col in range(n_cols):
-            a, b = sites[rows[0], col] == value, sites[rows[1], col] == value
-            one += a | b
-            two += a & b
-    else:
-        for col in range(n_cols):
-            a, b = sites[rows[0], col] == value, sites[rows[1], col] == value
-            c = sites[rows[2], col] == value
-            one += a | b | c
-            two += (a & b) | (a & c) | (b & c)
-            three += a & b & c
-    return min(one, limit) + min(two, limit) + min(three, limit)
-
-
-@helper_kernel()
-def bounds(sites: Bytes, chosen: Ints, n: int, limit: int, value: int) -> Ints:
-    """The bound of each choice of rows, see :func:`bound`."""
-    found = np.empty(len(chosen), np.int64)
-    for i in range(len(chosen)):
-        found[i] = bound(sites, chosen[i], n, limit, value)
-    return found
-
-
-@helper_kernel()
-def keep(candidates: Candidates, atoms: int, orientation: int, source: Ints, goal: Ints) -> Candidates:
-    """Add a candidate to those that are kept."""
-    kept, n_kept = candidates
-    if n_kept == N_KEPT:
-        if atoms <= kept[N_KEPT - 1, ATOMS]:
-            return candidates
-        n_kept -= 1
-    place = n_kept
-    while place > 0 and kept[place - 1, ATOMS] < atoms:
-        kept[place] = kept[place - 1]
-        place -= 1
-    n = len(source)
-    kept[place, ATOMS], kept[place, ORIENTATION], kept[place, N_ROWS] = atoms, orientation, n
-    kept[place, FROM : FROM + n] = source
-    kept[place, TO : TO + n] = goal
-    return kept, n_kept + 1
-
-
-@helper_kernel()
-def worth_keeping(candidates: Candidates) -> int:
-    """Least number of atoms of a candidate that would be kept."""
-    kept, n_kept = candidates
-    if n_kept == 0:
-        return 1
-    least = max(1, kept[0, ATOMS] - SLACK)
-    return max(least, kept[N_KEPT - 1, ATOMS] + 1) if n_kept == N_KEPT else least
-
-
-@helper_kernel(f"{CANDIDATES}({CANDIDATES}, uint8[:, ::1], uint8[:, ::1], int64, int64, int64, int64)")
-def try_rows(
-    candidates: Candidates, source: Bytes, vacant: Bytes, n: int, limit: int, orientation: int, n_left: int
-) -> Candidates:
-    """Add the best candidates of ``n`` rows, n up to 3, to those that are kept.
+@helper_kernel(f"{BATCH}({STATE}, int64)")
+def best_batch(state: State, number: int) -> Batch:
+    """Find the batch of lowest cost.
 
     Args:
-        candidates: Those that are kept.
-        source: uint8 (n_rows, n_cols), see :mod:`labseq_grid.kernels_columns`.
-        vacant: The same shape.
-        n: Number of rows.
-        limit: Maximum number of columns.
-        orientation: What the candidates are marked with.
-        n_left: Number of atoms after which the search is over.
+        state: The state before it.
+        number: Its number.
+
+    Returns:
+        The batch; without columns if there is none.
     """
-    n_rows, n_cols = source.shape
-    counts, rows = np.empty(n_rows, np.int64), np.empty(n_rows, np.int64)
-    count_sites(source, SPARE, counts)
-    n_sources = richest_rows(counts, SOURCE_ROWS_OF_FEW if n_left <= FEW else SOURCE_ROWS, rows)
-    froms = np.empty((n_choices(n_sources, n), MAX_ROWS), np.int64)
-    n_froms = choices(rows, n_sources, n, froms)
-    count_sites(vacant, 1, counts)
-    n_goals = richest_rows(counts, n_rows if n == 1 else GOAL_ROWS * (3 if n == 2 else 1), rows)
-    tos = np.empty((n_choices(n_goals, n), MAX_ROWS), np.int64)
-    n_tos = choices(rows, n_goals, n, tos)
-    if n_froms == 0 or n_tos == 0:
-        return candidates
-    from_bounds, to_bounds = bounds(source, froms, n, limit, SPARE), bounds(vacant, tos, n, limit, 1)
-    highest = to_bounds.max()
-    spare = np.empty((n_froms, 1 << n, n_cols + 1), np.int64)
-    end = np.empty((limit + 1, highest + 1), np.int64)
-    has_spare = np.zeros(n_froms, np.bool_)
-    n_trials = work = 0
-    for level in range(highest, 0, -1):
-        for k in range(n_tos):
-            if to_bounds[k] != level:
-                continue
-            for i in range(n_froms):
-                most = min(level, from_bounds[i], n_left)
-                if most < worth_keeping(candidates):
-                    continue
-                if not has_spare[i]:
-                    find_spare(source, froms[i], n, spare[i])
-                    has_spare[i] = True
-                atoms = most_carried(spare[i], n, vacant, tos[k], limit, most, end)
-                if atoms >= worth_keeping(candidates):
-                    candidates = keep(candidates, atoms, orientation, froms[i, :n], tos[k, :n])
-                n_trials += 1
-                work += n_cols * limit * most
-                kept, n_kept = candidates
-                is_complete = n_kept > 0 and kept[0, ATOMS] == n_left
-                if n_trials == TRIALS or work > WORK or is_complete:
-                    return candidates
-        if level <= worth_keeping(candidates):  # the next level is lower
-            break
-    return candidates
+    starts = np.empty((STARTS, 3), np.int64)
+    best, orientation, best_k, best_m = np.inf, 0, 0, 0
+    n_most = len(state[0][0][3][0])
+    rows, columns = np.empty((2, MAX_ROWS), np.int64), np.empty((3, n_most), np.int64)
+    best_rows, best_columns = np.empty_like(rows), np.empty_like(columns)
+    for i in range(find_starts(state, number, starts)):
+        rows[0, 0], rows[1, 0] = starts[i, 1], starts[i, 2]
+        view, pairs = state[starts[i, 0]]
+        price = pairs[0][starts[i, 1], starts[i, 2]] + TOLERANCE
+        cost, k, m = add_rows(view, pairs, rows, price, columns)
+        if cost < best - TOLERANCE:
+            best, orientation, best_k, best_m = cost, starts[i, 0], k, m
+            copy_columns(rows, k, best_rows)
+            copy_columns(columns, m, best_columns)
+    return orientation, best_rows[:, :best_k].copy(), best_columns[:, :best_m].copy()

