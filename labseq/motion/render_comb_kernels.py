@@ -5,70 +5,73 @@ group start on teeth of one comb and share one chirp: tone k has the phase
 
     phi_k + (nu + m_k mu) x + gamma x^2 / 2
 
-at x samples from the start of the segment. A block is L samples long, a whole number
-of the comb's periods: ``L mu`` is whole. With ``x = b L + j + delta`` the group's sum is
+at x samples from the start of the segment. In a strip, from x_0 on, x = x_0 + j, the sum of the group is
 
-    Re[T(j) A_b exp(2 pi i g_b j)]
-    T(j) = sum_k a_k exp 2 pi i (phi_k + m_k mu (j + delta)) exp 2 pi i (nu j + gamma j^2 / 2)
-    A_b  = exp 2 pi i (nu (b L + delta) + gamma (b L + delta)^2 / 2)
-    g_b  = gamma (b L + delta)
+    Re[P(j) exp 2 pi i (psi + (nu + gamma x_0) j) exp(pi i gamma j^2)]
+    P(j) = sum_k a_k exp 2 pi i (phi_k + m_k mu j)
 
-T is the same in all blocks of a segment. The rest is worked out in float64 for every
-LANES samples and for the samples within, and multiplied in float32: a parked group
-costs two operations per sample, a moving one six.
+P repeats itself after the comb's period, M samples with M mu whole. It is worked out once for as long as the
+tones stay together: from segment to segment only psi changes, and where P starts. Times the wave, whose
+frequency is constant in the strip, it is the table of the strip, a period long: from period to period its
+phase changes. The last factor is the same in all strips of tones of one speed, and kept. All this is worked
+out in float64 and multiplied in float32: a parked group costs two operations per sample, a moving one six.
 
 The loops are written for the compiler: only where an index cannot be negative and few
-arrays are written to does it use vector instructions; hence the slices and the split loops.
+arrays are written to does it use vector instructions; hence the slices and the split loops, and no
+conditions within them.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernels.kernel import const, helper_kernel, kernel
+from labseq.kernels.kernel import helper_kernel
+from labseq.motion.render_group_kernels import envelope, fit_cubic, next_of_group, off_tooth, segment_of
 from labseq.motion.render_kernels import (
-    AXIS,
     BLENDED,
     BLENDED_ROW,
+    BLOCK,
+    CHIRP,
+    CHUNK,
     CUBIC_ROW,
-    END,
     END_AMPLITUDE,
     F32,
     F64,
-    FINE,
+    FIRST_TOOTH,
+    FREQUENCY,
     FULL_SCALE,
-    LANES,
+    LANE_ROW,
     N_COEFFICIENTS,
+    N_TABLES,
+    NUMBER,
     ON_TOOTH,
+    PERIOD,
     PHASE,
+    PHASE_SINCE,
     SAMPLES,
-    START,
+    SINCE,
     START_AMPLITUDE,
+    STEADY,
+    STEP,
+    STRIP,
     STRIP_KEYS,
-    TABLES,
-    TONES,
-    V_ROW,
-    WITHIN,
-    WORKSPACE,
-    Axis,
-    Workspace,
+    TABLE_KEYS,
+    WAVE_ROW,
+    WORDS,
+    Words,
     add_tooth,
     apply_envelope,
-    envelope,
+    axis_of,
     fill_powers,
-    fill_table,
     find_chirp,
-    fit_cubic,
     is_there,
-    multiply,
-    off_tooth,
     repeat,
+    space_of,
     store,
-    strip_samples,
-    take_tones,
     times,
     turn,
 )
@@ -76,400 +79,350 @@ from labseq.motion.render_kernels import (
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-FREQUENCY: Final = 0  # of a group's state: nu, gamma, A_b, A_(b+1) / A_b, and what that changes by
-CHIRP: Final = 1
-NOW: Final = 2
-STEP: Final = 4
-STEP_OF_STEP: Final = 6
+
+Complex = tuple[float, float]
+COMPLEX: Final = "UniTuple(float64, 2)"
 
 
-@helper_kernel(f"void({F64}, float64[:, ::1], float64, float64)")
-def enter_block(state: Floats, lanes: Floats, x: float, length: float) -> None:
-    """Prepare a group for a block that starts ``x`` samples after the start of the segment.
-
-    Its frequency and chirp are given in ``state``, float64 (N_STATE,). The result ``lanes``, float64
-    (4, LANES + 1), is exp 2 pi i g_b r, and what it is multiplied by from block to block.
-    """
-    frequency, chirp = state[FREQUENCY], state[CHIRP]
-    state[NOW], state[NOW + 1] = turn(frequency * x + 0.5 * chirp * x * x)
-    state[STEP], state[STEP + 1] = turn((frequency + chirp * (x + 0.5 * length)) * length)
-    state[STEP_OF_STEP], state[STEP_OF_STEP + 1] = turn(chirp * length * length)
-    fill_powers(chirp * x, lanes[0], lanes[1])
-    fill_powers(chirp * length, lanes[2], lanes[3])
-
-
-@helper_kernel(f"void({F32}, int64, int64, {F32}, {F32}, {F64})", fused=True)
-def add_parked(acc: Singles, n: int, block: int, re: Singles, im: Singles, state: Floats) -> None:
-    """Add a group at rest to the first ``n`` samples of ``acc``, and advance its state to the next block.
-
-    ``re`` and ``im``, float32 (>= block,), are the group's table.
-    """
-    x, y = state[NOW], state[NOW + 1]
-    for b in range((n + block - 1) // block):
-        part = acc[b * block :]
-        now_re, now_im = np.float32(x), np.float32(y)
-        for j in range(min(block, n - b * block)):
-            part[j] += re[j] * now_re - im[j] * now_im
-        x, y = times(x, y, state[STEP], state[STEP + 1])
-    state[NOW], state[NOW + 1] = x, y
-
-
-@helper_kernel(
-    f"void({F32}, int64, {F32}, {F32}, float64, float64, float64, float64, {F32}, {F32})", fused=True
-)
-def add_block(
+@helper_kernel(f"void({F32}, int64, {F32}, {F32}, int64, int64, {COMPLEX}, {COMPLEX})", fused=True)
+def add_parked(
     acc: Singles,
     n: int,
     re: Singles,
     im: Singles,
-    x: float,
-    y: float,
-    jump_re: float,
-    jump_im: float,
-    v_re: Singles,
-    v_im: Singles,
+    offset: int,
+    period: int,
+    now: Complex,
+    by: Complex,
 ) -> None:
-    """Add a moving group to ``n`` samples of one block; see :func:`add_moving`."""
-    for q in range(n // LANES):
-        at = q * LANES
+    """Add a group at rest, multiplied by ``now``, to ``n`` samples; see :func:`add_moving`.
+
+    ``offset`` is where in the table the first sample is.
+    """
+    x, y = now
+    for q in range((n + CHUNK - 1) // CHUNK):
+        out, t_re, t_im = acc[q * CHUNK :], re[offset:], im[offset:]
         now_re, now_im = np.float32(x), np.float32(y)
-        for r in range(LANES):
-            w_re = now_re + (now_re * v_re[r] - now_im * v_im[r])
-            w_im = now_im + (now_re * v_im[r] + now_im * v_re[r])
-            acc[at + r] += re[at + r] * w_re - im[at + r] * w_im
-        x, y = x * jump_re - y * jump_im, x * jump_im + y * jump_re
-    at = n // LANES * LANES
-    now_re, now_im = np.float32(x), np.float32(y)
-    for r in range(n - at):
-        w_re = now_re + (now_re * v_re[r] - now_im * v_im[r])
-        w_im = now_im + (now_re * v_im[r] + now_im * v_re[r])
-        acc[at + r] += re[at + r] * w_re - im[at + r] * w_im
+        for r in range(CHUNK):
+            out[r] += t_re[r] * now_re - t_im[r] * now_im
+        offset += CHUNK
+        if offset >= period:
+            offset -= period
+            x, y = times(x, y, by[0], by[1])
 
 
-@helper_kernel(
-    f"void({F32}, int64, int64, {F32}, {F32}, {F64}, {F64}, {F64}, {F64}, {F64}, {F32}, {F32})", fused=True
-)
+@helper_kernel(f"void({F32}, int64, {F32}, {F32}, int64, {COMPLEX}, {F32}, {F32})", fused=True)
 def add_moving(
     acc: Singles,
     n: int,
-    block: int,
     re: Singles,
     im: Singles,
-    state: Floats,
-    lane_re: Floats,
-    lane_im: Floats,
-    by_re: Floats,
-    by_im: Floats,
-    v_re: Singles,
-    v_im: Singles,
+    period: int,
+    by: Complex,
+    chirp_re: Singles,
+    chirp_im: Singles,
 ) -> None:
-    """Add a moving group to the first ``n`` samples of ``acc``, and advance its state to the next block.
+    """Add a moving group to ``n`` samples, rounded up to whole chunks.
 
-    The lanes, float64 (LANES + 1,), are cosine and sine of g_b r, and what they are multiplied by from
-    block to block. ``v_re`` and ``v_im`` are scratch: the lanes less 1, of which float32 holds more digits.
+    Args:
+        acc: The samples; updated.
+        n: How many.
+        re: Real part of the table, float32 (>= min(period, n) + CHUNK,).
+        im: Its imaginary part.
+        period: Its period.
+        by: By which it is multiplied from period to period.
+        chirp_re: Real part of the chirp, float32 (>= n + CHUNK,).
+        chirp_im: Its imaginary part.
     """
-    for b in range((n + block - 1) // block):
-        for r in range(LANES):
-            v_re[r] = np.float32(lane_re[r] - 1.0)
-            v_im[r] = np.float32(lane_im[r])
-        add_block(
-            acc[b * block :], min(block, n - b * block), re, im, state[NOW], state[NOW + 1],
-            lane_re[LANES], lane_im[LANES], v_re, v_im,
-        )  # fmt: skip
-        x, y = state[STEP], state[STEP + 1]
-        state[NOW], state[NOW + 1] = times(state[NOW], state[NOW + 1], x, y)
-        state[STEP], state[STEP + 1] = times(x, y, state[STEP_OF_STEP], state[STEP_OF_STEP + 1])
-        multiply(lane_re, lane_im, by_re, by_im, LANES + 1)
-
-
-@helper_kernel(f"void(float32[:, ::1], int64, float64, {const('float32', 1)}, {F32}, {F32})", fused=True)
-def blend(tables: Singles, n: int, u: float, within: Singles, re: Singles, im: Singles) -> None:
-    """Blend four tables into one by a cubic in the time since the start of the segment.
-
-    ``tables``, float32 (8, >= n), are real and imaginary part of the coefficient of each power. ``u``
-    is the fraction of the segment that has passed at the start of the block, ``within`` that from
-    there to each sample.
-    """
-    first = np.float32(u)
-    for part, out in ((0, re), (1, im)):
-        c0, c1, c2, c3 = tables[part], tables[part + 2], tables[part + 4], tables[part + 6]
-        for j in range(n):
-            t = first + within[j]
-            out[j] = c0[j] + t * (c1[j] + t * (c2[j] + t * c3[j]))
-
-
-Ints = NDArray[np.int32]
+    x, y, offset = 1.0, 0.0, 0
+    for q in range((n + CHUNK - 1) // CHUNK):
+        at = q * CHUNK
+        out, t_re, t_im, c_re, c_im = acc[at:], re[offset:], im[offset:], chirp_re[at:], chirp_im[at:]
+        now_re, now_im = np.float32(x), np.float32(y)
+        for r in range(CHUNK):
+            w_re, w_im = now_re * c_re[r] - now_im * c_im[r], now_re * c_im[r] + now_im * c_re[r]
+            out[r] += t_re[r] * w_re - t_im[r] * w_im
+        offset += CHUNK
+        if offset >= period:
+            offset -= period
+            x, y = times(x, y, by[0], by[1])
 
 
 @helper_kernel(
-    f"void({TONES}, {const('int32', 1)}, {TONES}, int64, int64, float64, float64, float64, boolean, int64,"
-    " float64[:, ::1])"
+    f"void(float32[:, ::1], int64, int64, {COMPLEX}, float64, float64, float32[:, ::1])", fused=True
 )
-def add_to_sums(
-    tones: Floats,
-    tooth: Ints,
-    teeth: Floats,
-    k: int,
-    anchor: int,
-    delta: float,
-    length: float,
-    step: float,
-    shared: bool,
-    n_tables: int,
-    sums: Floats,
+def blend(
+    tables: Singles, n: int, period: int, by: Complex, u: float, per_sample: float, work: Singles
 ) -> None:
-    """Add tone ``k`` to the sums over a period, one for each power of the time.
+    """Blend tables by a cubic in the time since the start of the segment, for ``n`` samples of a strip.
 
-    ``delta`` and ``length`` are those of its segment, ``anchor`` is the first tone of its group.
+    Args:
+        tables: float32 (N_SUMS, ...), real and imaginary part of the coefficient of each power.
+        n: How many samples, rounded up to whole chunks.
+        period: Period of the tables.
+        by: By which they are multiplied from period to period.
+        u: Fraction of the segment that has passed at the first sample.
+        per_sample: What is added from sample to sample.
+        work: Of the workspace. The result is its two rows from BLENDED_ROW on.
     """
-    re, im = sums[CUBIC_ROW], sums[CUBIC_ROW + 1]
+    x, y, offset = 1.0, 0.0, 0
+    slope = np.float32(per_sample)
+    for q in range((n + CHUNK - 1) // CHUNK):
+        first, now_re, now_im = np.float32(u + per_sample * (q * CHUNK)), np.float32(x), np.float32(y)
+        re, im = work[BLENDED_ROW, q * CHUNK :], work[BLENDED_ROW + 1, q * CHUNK :]
+        for part, out in ((0, re), (1, im)):
+            c0, c1 = tables[part, offset:], tables[part + 2, offset:]
+            c2, c3 = tables[part + 4, offset:], tables[part + 6, offset:]
+            for r in range(CHUNK):
+                t = first + slope * np.float32(r)
+                out[r] = c0[r] + t * (c1[r] + t * (c2[r] + t * c3[r]))
+        for r in range(CHUNK):
+            a, b = re[r], im[r]
+            re[r] = a * now_re - b * now_im
+            im[r] = a * now_im + b * now_re
+        offset += CHUNK
+        if offset >= period:
+            offset -= period
+            x, y = times(x, y, by[0], by[1])
+
+
+@helper_kernel(f"void({WORDS}, int64, int64, int64, boolean, int64)")
+def add_to_sums(words: Words, i: int, k: int, anchor: int, shared: bool, n_sums: int) -> None:
+    """Add tone ``k`` of segment ``i`` to the sums over a period, one for each power of the time.
+
+    ``anchor`` is the first tone of its group.
+    """
+    axis, sums, step = axis_of(words), space_of(words).scratch, words.view(np.float64)[STEP]
+    tones, tooth, re, im = axis.tones, int(axis.tooth[k]), sums[CUBIC_ROW], sums[CUBIC_ROW + 1]
     a, b = tones[START_AMPLITUDE, k], tones[END_AMPLITUDE, k]
     if shared:
         a = b = max(a, b)
-    if n_tables == 1:
+    if n_sums == 1:
         re[0], im[0] = a, 0.0
     else:
-        drift, bend = off_tooth(tones, k, anchor, tooth[k], tooth[anchor], step, length)
-        fit_cubic(a, b, drift, bend, re, im)
-    x, y = turn(tones[PHASE, k] + step * tooth[k] * delta)
-    for power in range(n_tables):
+        drift, bend = off_tooth(tones, k, anchor, tooth - axis.tooth[anchor], step, axis.length[i])
+        fit_cubic(a, b, drift, bend, re[:N_COEFFICIENTS], im[:N_COEFFICIENTS])
+    x, y = turn(tones[PHASE, k] + step * tooth * axis.delta[i])
+    cosine, sine = (
+        axis.teeth[2 * (tooth - words[FIRST_TOOTH])],
+        axis.teeth[2 * (tooth - words[FIRST_TOOTH]) + 1],
+    )
+    for power in range(n_sums):
         w_re = FULL_SCALE * (x * re[power] - y * im[power])
         w_im = FULL_SCALE * (x * im[power] + y * re[power])
-        add_tooth(
-            teeth[2 * tooth[k]], teeth[2 * tooth[k] + 1], w_re, w_im, sums[2 * power], sums[2 * power + 1]
-        )
+        add_tooth(cosine, sine, w_re, w_im, sums[2 * power], sums[2 * power + 1])
 
 
-@helper_kernel(f"void({AXIS}, int64, int64, boolean, boolean, {WORKSPACE})")
-def fill_group(axis: Axis, i: int, g: int, shared: bool, blended: bool, workspace: Workspace) -> None:
-    """Fill the tables of a group of segment ``i``."""
-    tones, tooth, group, teeth, step, block = axis[0], axis[4], axis[5], axis[6], axis[10], axis[11]
-    sums, tables, state = workspace[0], workspace[2], workspace[4]
-    length, period, n_tables = axis[9][i], teeth.shape[1], N_COEFFICIENTS if blended else 1
-    sums[: 2 * n_tables, :period] = 0.0
-    anchor = -1
-    for k in range(axis[1][i], axis[1][i + 1]):
-        if group[k] == g:
-            anchor = k if anchor < 0 else anchor
-            add_to_sums(tones, tooth, teeth, k, anchor, axis[8][i], length, step, shared, n_tables, sums)
-    state[g, FREQUENCY] = tones[START, anchor] - step * tooth[anchor]
-    state[g, CHIRP] = (tones[END, anchor] - tones[START, anchor]) / length
-    at = find_chirp(state[g, FREQUENCY], state[g, CHIRP], block, workspace[5], workspace[6], workspace[3][g])
-    re, im = workspace[5][at, 0], workspace[5][at, 1]
-    for row in range(0, 2 * n_tables, 2):
-        fill_table(sums[row], sums[row + 1], period, re, im, block, tables[g, row], tables[g, row + 1])
+@helper_kernel(f"int64({F64}, int64, int64)")
+def find_sums(keys: Floats, number: int, anchor: int) -> int:
+    """Where the sums of a group are in the workspace, by its first tone; -1 if they are not there."""
+    for at in range(N_TABLES):
+        if keys[TABLE_KEYS + 3 * at] == number and keys[TABLE_KEYS + 3 * at + 1] == anchor:
+            return at
+    return -1
 
 
-@helper_kernel(f"void({WORKSPACE}, int64, int64, int64)", fused=True)
-def add_group(workspace: Workspace, g: int, n: int, block: int) -> None:
-    """Add a group to the first ``n`` samples of a strip."""
-    work, tables, lanes, state = workspace[1], workspace[2], workspace[3], workspace[4]
-    re, im = tables[g, 0], tables[g, 1]
-    if state[g, CHIRP] == 0.0:
-        add_parked(work[SAMPLES], n, block, re, im, state[g])
-    else:
-        add_moving(
-            work[SAMPLES], n, block, re, im, state[g],
-            lanes[g, 0], lanes[g, 1], lanes[g, 2], lanes[g, 3], work[V_ROW], work[V_ROW + 1],
-        )  # fmt: skip
+@helper_kernel(f"void({WORDS}, int64)")
+def find_all_sums(words: Words, i: int) -> None:
+    """Fill in the sums of the groups of segment ``i`` that are not in the workspace."""
+    axis, keys, number = axis_of(words), space_of(words).keys, words[NUMBER]
+    table = axis.table[axis.offsets[i] : axis.offsets[i + 1]]
+    for anchor in table:
+        at = find_sums(keys, number, anchor) if anchor >= 0 else -1
+        if at >= 0:
+            keys[TABLE_KEYS + 3 * at + 2] = i
+    for anchor in table:
+        if anchor < 0 or find_sums(keys, number, anchor) >= 0:
+            continue
+        at = int(keys[TABLE_KEYS - 1])
+        while keys[TABLE_KEYS + 3 * at] == number and keys[TABLE_KEYS + 3 * at + 2] == i:
+            at = (at + 1) % N_TABLES
+        keys[TABLE_KEYS + 3 * at], keys[TABLE_KEYS + 3 * at + 1] = number, anchor
+        keys[TABLE_KEYS + 3 * at + 2], keys[TABLE_KEYS - 1] = i, (at + 1) % N_TABLES
+        fill_sums(words, anchor, at)
 
 
-@helper_kernel(f"void({WORKSPACE}, int64, int64, int64, float64, float64)")
-def add_blended_group(workspace: Workspace, g: int, n: int, block: int, u: float, per_block: float) -> None:
-    """Add a blended group to the first ``n`` samples of a strip, which starts ``u`` into the segment."""
-    work, tables, lanes, state = workspace[1], workspace[2], workspace[3], workspace[4]
-    re, im = work[BLENDED_ROW], work[BLENDED_ROW + 1]
-    for b in range((n + block - 1) // block):
-        length = min(block, n - b * block)
-        acc = work[SAMPLES, b * block :]
-        blend(tables[g], length, u + b * per_block, work[WITHIN], re, im)
-        if state[g, CHIRP] == 0.0:
-            add_parked(acc, length, block, re, im, state[g])
-        else:
-            add_moving(
-                acc, length, block, re, im, state[g],
-                lanes[g, 0], lanes[g, 1], lanes[g, 2], lanes[g, 3], work[V_ROW], work[V_ROW + 1],
-            )  # fmt: skip
+@helper_kernel(f"void({WORDS}, int64, int64)")
+def fill_sums(words: Words, anchor: int, at: int) -> None:
+    """Fill in the sums of the group whose first tone is ``anchor``, the workspace's number ``at``.
+
+    They are those of two periods and more from the first sample of its segment on.
+    """
+    axis, space, period = axis_of(words), space_of(words), words[PERIOD]
+    i = segment_of(axis, anchor)
+    k, stop, n_sums = anchor, axis.offsets[i + 1], N_COEFFICIENTS if axis.path[i] == BLENDED else 1
+    space.scratch[: 2 * n_sums, :period] = 0.0
+    shared, _, _ = envelope(axis.tones, axis.offsets[i], stop)
+    while k < stop:
+        add_to_sums(words, i, k, anchor, shared, n_sums)
+        k = next_of_group(axis.group, axis.group[anchor], k + 1, stop)
+    for row in range(2 * n_sums):
+        once, twice, total = space.sums[at, row], space.sums[at, row, period:], space.scratch[row]
+        for j in range(period):
+            once[j] = np.float32(total[j])
+        for j in range(min(period, STRIP) + 2 * CHUNK):
+            twice[j] = once[j]
 
 
-@helper_kernel(f"boolean(int64, int64, float64, {WORKSPACE})")
-def has_period(n_groups: int, block: int, length: float, workspace: Workspace) -> bool:
-    """Whether all blocks of a segment are equal: its tones are parked, with whole cycles per block."""
-    for g in range(n_groups):
-        cycles = workspace[4][g, FREQUENCY] * block
-        if workspace[4][g, CHIRP] != 0.0 or abs(cycles - np.rint(cycles)) * length > ON_TOOTH * block:
+@helper_kernel(
+    "void(float32[:, ::1], int64, int64, int64, float64, float64, float64, float64[:, ::1],"
+    " float32[:, ::1], float32[:, ::1])",
+    fused=True,
+)
+def fill_tables(
+    sums: Singles,
+    n_sums: int,
+    first: int,
+    n: int,
+    sign: float,
+    phase: float,
+    frequency: float,
+    scratch: Floats,
+    work: Singles,
+    tables: Singles,
+) -> None:
+    """Multiply sums by exp 2 pi i (phase + frequency j), j = 0 ... n - 1, and conjugate if ``sign`` is -1.
+
+    Args:
+        sums: float32 (N_SUMS, ...), real and imaginary part of each.
+        n_sums: How many.
+        first: Where j is 0.
+        n: How many samples; there is room for CHUNK more.
+        sign: 1 or -1.
+        phase: In cycles.
+        frequency: In cycles per sample.
+        scratch: Of the workspace.
+        work: Likewise.
+        tables: Result, float32 (N_SUMS, ...).
+    """
+    lane_re, lane_im = scratch[LANE_ROW, :CHUNK], scratch[LANE_ROW + 1, :CHUNK]
+    by_re, by_im = fill_powers(sign * frequency, lane_re, lane_im)
+    wave_re, wave_im = work[WAVE_ROW], work[WAVE_ROW + 1]
+    for r in range(CHUNK):
+        wave_re[r] = np.float32(lane_re[r])
+    for r in range(CHUNK):
+        wave_im[r] = np.float32(lane_im[r])
+    x, y = turn(sign * phase)
+    side = np.float32(sign)
+    for q in range((n + CHUNK - 1) // CHUNK):
+        at = q * CHUNK
+        a, b = np.float32(x), np.float32(y)
+        for row in range(0, 2 * n_sums, 2):
+            re, im = sums[row, first + at :], sums[row + 1, first + at :]
+            out_re, out_im = tables[row, at:], tables[row + 1, at:]
+            for r in range(CHUNK):
+                w_re, w_im = a * wave_re[r] - b * wave_im[r], a * wave_im[r] + b * wave_re[r]
+                out_re[r] = re[r] * w_re - side * im[r] * w_im
+                out_im[r] = re[r] * w_im + side * im[r] * w_re
+        x, y = times(x, y, by_re, by_im)
+
+
+STILL: Final = 1e-13
+"""Frequency that makes no difference in a strip, in cycles per sample."""
+
+
+@helper_kernel(f"void({WORDS}, int64, int64, int64, float64, float64, float64, float64, float64)")
+def add_group(
+    words: Words,
+    n: int,
+    at: int,
+    offset: int,
+    phase: float,
+    frequency: float,
+    chirp: float,
+    u: float,
+    per_sample: float,
+) -> None:
+    """Add a group to ``n`` samples of a strip.
+
+    Args:
+        words: Of axis and workspace.
+        n: How many.
+        at: Number of its sums in the workspace.
+        offset: Where in them the first sample is.
+        phase: Phase of its wave there, in cycles.
+        frequency: Frequency, in cycles per sample.
+        chirp: Chirp, in cycles per sample squared.
+        u: Fraction of the segment that has passed at the first sample.
+        per_sample: What is added to it from sample to sample; 0 if the group is not blended.
+    """
+    space, period, by = space_of(words), words[PERIOD], (1.0, 0.0)
+    sums, work, tables, scratch = space.sums[at], space.work, space.table, space.scratch
+    acc = work[SAMPLES]
+    if chirp == 0.0 and abs(frequency) < STILL and per_sample == 0.0:
+        now = turn(phase + 0.5 * frequency * n)
+        add_parked(acc, n, sums[0], sums[1], offset, period, now, by)
+        return
+    n_sums, sign = 1 if per_sample == 0.0 else N_COEFFICIENTS, math.copysign(1.0, chirp)
+    # the real part is that of the conjugate, so that a chirp serves both directions
+    fill_tables(sums, n_sums, offset, min(period, n) + CHUNK, sign, phase, frequency, scratch, work, tables)
+    by = turn(sign * frequency * period)
+    re, im = tables[0], tables[1]
+    if per_sample != 0.0:
+        blend(tables, n, period, by, u, per_sample, work)
+        re, im, period, by = work[BLENDED_ROW], work[BLENDED_ROW + 1], n + CHUNK, (1.0, 0.0)
+    if chirp == 0.0:
+        add_parked(acc, n, re, im, 0, period, (1.0, 0.0), by)
+        return
+    c = find_chirp(abs(chirp), space.chirps, space.keys, scratch[LANE_ROW:])
+    add_moving(acc, n, re, im, period, by, space.chirps[c, 0], space.chirps[c, 1])
+
+
+@helper_kernel(f"void({WORDS}, int64, int64, int64)")
+def fill_strip(words: Words, i: int, start: int, n: int) -> None:
+    """Fill in ``n`` samples of segment ``i`` from ``start`` on, those of steady tones after the envelope."""
+    axis, space = axis_of(words), space_of(words)
+    waves, acc, keys, length = axis.waves, space.work[SAMPLES], space.keys, axis.length[i]
+    x, slope = start + axis.delta[i], (axis.squares[1, i] - axis.squares[0, i]) / length
+    per_sample = 1.0 / length if axis.path[i] == BLENDED else 0.0
+    acc[:n] = np.float32(0.0)
+    for steady in (0.0, 1.0):
+        if steady == 1.0 and slope != 0.0:
+            apply_envelope(acc, n, axis.squares[0, i] + slope * x, slope)
+        for k in range(axis.offsets[i], axis.offsets[i + 1]):
+            if axis.table[k] < 0 or waves[STEADY, k] != steady:
+                continue
+            frequency, chirp = waves[FREQUENCY, k], waves[CHIRP, k]
+            phase = waves[PHASE_SINCE, k] + x * (frequency + 0.5 * chirp * x)
+            offset = (int(waves[SINCE, k]) + start) % words[PERIOD]
+            at = find_sums(keys, words[NUMBER], axis.table[k])
+            add_group(words, n, at, offset, phase, frequency + chirp * x, chirp, x * per_sample, per_sample)
+
+
+@helper_kernel(f"boolean({WORDS}, int64)")
+def has_period(words: Words, i: int) -> bool:
+    """Whether all blocks of a segment are equal: steady tones on the comb are parked, with whole cycles."""
+    axis, block = axis_of(words), words[BLOCK]
+    waves = axis.waves
+    for k in range(axis.offsets[i], axis.offsets[i + 1]):
+        cycles = waves[FREQUENCY, k] * block
+        if axis.table[k] >= 0 and not (
+            waves[STEADY, k] == 1.0
+            and waves[CHIRP, k] == 0.0
+            and abs(cycles - np.rint(cycles)) * axis.length[i] <= ON_TOOTH * block
+        ):
             return False
-    return True
+    return axis.path[i] != BLENDED
 
 
-@helper_kernel(f"void({AXIS}, int64, int64, int16[::1], {WORKSPACE})")
-def render_comb(axis: Axis, i: int, skip: int, out: NDArray[np.int16], workspace: Workspace) -> None:
+@helper_kernel(f"void({WORDS}, int64, int64, int16[::1])")
+def render_comb(words: Words, i: int, skip: int, out: NDArray[np.int16]) -> None:
     """Render a part of segment ``i``, on the comb or blended, from sample ``skip`` of the segment on.
 
     It is worked out strip by strip, each from its start, so that a sample does not depend
     on the stretch.
     """
-    _, offsets, _, path, _, _, _, _, delta, lengths, _, block, number = axis
-    work, lanes, state, keys = workspace[1], workspace[3], workspace[4], workspace[6]
-    shared, first, last = envelope(axis[0], offsets[i], offsets[i + 1])
-    blended, length = path[i] == BLENDED, lengths[i]
-    slope = (last - first) / length
-    n_groups = axis[5][offsets[i] : offsets[i + 1]].max() + 1
-    if not is_there(keys, TABLES, number, i, 0):  # else the stretch before was of this segment, too
-        for g in range(n_groups):
-            fill_group(axis, i, g, shared, blended, workspace)
-        if blended:
-            for j in range(block):
-                work[WITHIN, j] = np.float32(j / length)
-    if first == last and not blended and has_period(n_groups, block, length, workspace):
-        keys[STRIP_KEYS] = -1
-        work[SAMPLES, :block] = np.float32(0.0)
-        for g in range(n_groups):
-            enter_block(state[g], lanes[g], delta[i], float(block))
-            add_group(workspace, g, block, block)
-        store(workspace[8], block, work[SAMPLES], 0)
-        repeat(out, skip, workspace[8], block)
+    axis, space, number, block = axis_of(words), space_of(words), words[NUMBER], words[BLOCK]
+    keys, samples, n_samples = space.keys, space.work[SAMPLES], axis.first[i + 1] - axis.first[i]
+    find_all_sums(words, i)
+    if has_period(words, i):
+        if not is_there(keys, STRIP_KEYS, number, i, -1):
+            fill_strip(words, i, 0, block)
+            store(space.repeated, block, samples, 0)
+        repeat(out, skip, space.repeated, block)
         return
-    strip, n_samples = strip_samples(block), axis[7][i + 1] - axis[7][i]
-    for s in range(skip // strip, (skip + len(out) - 1) // strip + 1):
-        x = s * strip + delta[i]
-        start, stop = max(0, skip - s * strip), min(strip, skip + len(out) - s * strip)
-        if not is_there(keys, STRIP_KEYS, number, i, s):
-            whole = min(strip, n_samples - s * strip)  # a stretch that follows needs the rest
-            work[SAMPLES, :whole] = np.float32(0.0)
-            for g in range(n_groups):
-                enter_block(state[g], lanes[g], x, float(block))
-                if blended:
-                    add_blended_group(workspace, g, whole, block, x / length, block / length)
-                else:
-                    add_group(workspace, g, whole, block)
-            if first != last:
-                apply_envelope(work[SAMPLES], whole, first + slope * x, slope)
-        store(out[s * strip + start - skip :], stop - start, work[SAMPLES], start)
-
-
-MAX_TEETH: Final = 64
-
-MAX_TONES: Final = 4 * MAX_TEETH
-"""Maximum number of frequencies in the search for a comb."""
-
-TOLERANCE_HZ: Final = 100.0
-"""Tones closer than this to a tooth count as on it in the search for a comb, in Hz."""
-
-GRAIN_HZ: Final = 10.0
-"""Step of the spacings tried in the search, in Hz."""
-
-TEETH: Final = "float64[::1]"
-CONST: Final = const("float64", 1)
-
-
-@kernel(f"int64({CONST}, {TEETH})")
-def distinct_tones(start_hz: Floats, distinct_hz: Floats) -> int:
-    """Collect the different frequencies of some tones, to 1 Hz, in rising order.
-
-    Returns how many there are; -1 if they are more than ``distinct_hz``, float64 (MAX_TONES,), can hold.
-    """
-    n = 0
-    for k in range(len(start_hz)):
-        hz = np.rint(start_hz[k])
-        at = int(np.searchsorted(distinct_hz[:n], hz))
-        if at < n and distinct_hz[at] == hz:
-            continue
-        if n == len(distinct_hz):
-            return -1
-        for i in range(n, at, -1):
-            distinct_hz[i] = distinct_hz[i - 1]
-        distinct_hz[at] = hz
-        n += 1
-    return n
-
-
-@helper_kernel(f"Tuple((int64, float64))({CONST}, float64)")
-def count_multiples(gaps_hz: Floats, spacing_hz: float) -> tuple[int, float]:
-    """Count the gaps that are a multiple of a spacing, and find the spacing that fits those best."""
-    n, gap_hz, multiples = 0, 0.0, 0.0
-    for gap in gaps_hz:
-        multiple = np.rint(gap / spacing_hz)
-        if multiple > 0.0 and abs(gap - multiple * spacing_hz) <= TOLERANCE_HZ:
-            n += 1
-            gap_hz += gap
-            multiples += multiple
-    return n, gap_hz / multiples if n > 0 else 0.0
-
-
-@kernel(f"float64({CONST})")
-def common_spacing(tones_hz: Floats) -> float:
-    """Find the largest spacing, in Hz, of which most gaps between rising frequencies are a multiple.
-
-    Candidates are the gaps and the differences of any two. Returns 0 if there is one tone only, -1 if
-    there are too many for a comb.
-    """
-    gaps_hz = tones_hz[1:] - tones_hz[:-1]
-    gaps_hz = gaps_hz[gaps_hz > TOLERANCE_HZ]
-    if len(gaps_hz) == 0:
-        return 0.0
-    if len(gaps_hz) >= MAX_TEETH:
-        return -1.0
-    most, tried, best = 0, 0.0, 0.0
-    for i in range(len(gaps_hz)):
-        for j in range(i, len(gaps_hz)):
-            apart = gaps_hz[i] if i == j else abs(gaps_hz[i] - gaps_hz[j])
-            candidate = GRAIN_HZ * np.rint(apart / GRAIN_HZ)
-            if apart <= TOLERANCE_HZ or candidate == tried:
-                continue
-            n, spacing = count_multiples(gaps_hz, candidate)
-            if n > most or (n == most and candidate > tried):
-                most, tried, best = n, candidate, spacing
-    return best
-
-
-@kernel(
-    f"UniTuple(int64, 2)({CONST}, {CONST}, {CONST}, {CONST}, {CONST}, {const('int32', 1)}, float64,"
-    " float64[:, ::1], float64[::1])"
-)
-def survey(
-    start_hz: Floats,
-    end_hz: Floats,
-    start_amplitude: Floats,
-    end_amplitude: Floats,
-    phase_rad: Floats,
-    offsets: Ints,
-    sample_rate_hz: float,
-    tones: Floats,
-    comb_hz: Floats,
-) -> tuple[int, int]:
-    """Convert the tones of an axis as :func:`take_tones` does, with its result, and look for a comb.
-
-    ``comb_hz``, float64 (3,), is its spacing (see :func:`common_spacing`), its first tooth, and the distance
-    of the last one.
-    """
-    fault, where = take_tones(
-        start_hz, end_hz, start_amplitude, end_amplitude, phase_rad, offsets, sample_rate_hz, tones
-    )
-    comb_hz[0] = -1.0
-    if fault == FINE:
-        distinct_hz = np.empty(MAX_TONES)
-        n = distinct_tones(start_hz, distinct_hz)
-        if n > 0:
-            comb_hz[0] = common_spacing(distinct_hz[:n])
-            comb_hz[1], comb_hz[2] = start_hz.min(), distinct_hz[n - 1] - distinct_hz[0]
-    return fault, where
-
-
-@kernel(f"void({CONST}, {CONST}, int64, float64[:, ::1])")
-def fill_teeth(cosine: Floats, sine: Floats, numerator: int, teeth: Floats) -> None:
-    """Fill in cosine and sine of each tooth's distance from the first over a period.
-
-    The result is float64 (2 n_teeth, period). ``cosine`` and ``sine``, float64 (period,), are those of
-    one turn in steps of 1 / period; ``numerator`` is the number of turns per period from one tooth to
-    the next.
-    """
-    period = len(cosine)
-    for tooth in range(len(teeth) // 2):
-        step, at = tooth * numerator % period, 0
-        for j in range(period):
-            teeth[2 * tooth, j] = cosine[at]
-            teeth[2 * tooth + 1, j] = sine[at]
-            at += step
-            if at >= period:
-                at -= period
+    for s in range(skip // STRIP, (skip + len(out) - 1) // STRIP + 1):
+        start, end = max(0, skip - s * STRIP), min(STRIP, skip + len(out) - s * STRIP)
+        if not is_there(keys, STRIP_KEYS, number, i, s):  # a stretch that follows needs the rest
+            fill_strip(words, i, s * STRIP, min(STRIP, n_samples - s * STRIP))
+        store(out[s * STRIP + start - skip :], end - start, samples, start)

@@ -16,35 +16,31 @@ from numpy.typing import NDArray
 from labseq.kernels.kernel import helper_kernel, kernel
 from labseq.kernels.native import carray, pointer
 from labseq.motion.render_comb_kernels import render_comb
+from labseq.motion.render_group_kernels import envelope, is_steady
 from labseq.motion.render_kernels import (
-    AXIS,
     DIRECT,
     END,
     END_AMPLITUDE,
     FULL_SCALE,
     LANES,
-    MAX_GROUPS,
-    N_CHIRPS,
-    N_FIELDS,
-    N_KEYS,
-    N_ROWS32,
-    N_ROWS64,
-    N_STATE,
-    N_SUMS,
+    N_OUT,
+    N_SEGMENTS,
+    N_WORDS,
+    NUMBER,
     PHASE,
     SAMPLES,
     SILENT,
     START,
     START_AMPLITUDE,
+    STRIP,
     STRIP_KEYS,
-    WORKSPACE,
-    Axis,
-    Workspace,
+    WORDS,
+    Words,
     apply_envelope,
-    envelope,
+    axis_of,
     is_there,
+    space_of,
     store,
-    strip_samples,
 )
 
 Floats = NDArray[np.float64]
@@ -259,149 +255,84 @@ def add_steep(
         acc[j] += np.float32(amplitude * math.cos(2.0 * math.pi * (cycles - np.rint(cycles))))
 
 
-@helper_kernel(f"void({AXIS}, int64, int64, float64, int64, boolean, {WORKSPACE})")
-def add_direct(axis: Axis, i: int, k: int, x: float, n: int, shared: bool, workspace: Workspace) -> None:
+@helper_kernel(f"void({WORDS}, int64, int64, float64, int64, boolean)")
+def add_direct(words: Words, i: int, k: int, x: float, n: int, shared: bool) -> None:
     """Add tone ``k`` of segment ``i`` to ``n`` samples, the first of them ``x`` samples after its start."""
-    tones, _, course, _, _, _, _, _, _, length, _, _, _ = axis
-    work, nodes = workspace[1], workspace[7]
+    axis, space = axis_of(words), space_of(words)
+    tones, length, kind = axis.tones, axis.length[i], axis.course[i]
+    acc, nodes = space.work[SAMPLES], space.nodes
     a, b = tones[START_AMPLITUDE, k], tones[END_AMPLITUDE, k]
     if shared:
         a = b = max(a, b)
     phase, frequency, sweep = tones[PHASE, k], tones[START, k], tones[END, k] - tones[START, k]
-    slope = FULL_SCALE**2 * (b * b - a * a) / length[i]
+    slope = FULL_SCALE**2 * (b * b - a * a) / length
     start = FULL_SCALE**2 * a * a + slope * x
-    if is_steep(course[i], sweep, length[i]):
-        add_steep(work[SAMPLES], n, course[i], phase, frequency, sweep, length[i], x, start, slope)
+    if is_steep(kind, sweep, length):
+        add_steep(acc, n, kind, phase, frequency, sweep, length, x, start, slope)
         return
     n_nodes = (n + LANES - 1) // LANES
-    fill_nodes(course[i], phase, frequency, sweep, length[i], x, n_nodes, nodes)
+    fill_nodes(kind, phase, frequency, sweep, length, x, n_nodes, nodes)
     if a == b:
-        add_tone(work[SAMPLES], n_nodes, nodes, FULL_SCALE * a)
+        add_tone(acc, n_nodes, nodes, FULL_SCALE * a)
     else:
-        add_ramped_tone(work[SAMPLES], n_nodes, nodes, start, slope)
+        add_ramped_tone(acc, n_nodes, nodes, start, slope)
 
 
-@helper_kernel(f"void({AXIS}, int64, int64, int16[::1], {WORKSPACE})")
-def render_direct(axis: Axis, i: int, skip: int, out: NDArray[np.int16], workspace: Workspace) -> None:
+@helper_kernel(f"void({WORDS}, int64, int64, int16[::1])")
+def render_direct(words: Words, i: int, skip: int, out: NDArray[np.int16]) -> None:
     """Render a part of segment ``i`` tone by tone; see :func:`render_comb`."""
-    tones, offsets, _, _, _, _, _, at, delta, length, _, block, number = axis
-    work = workspace[1]
+    axis, space = axis_of(words), space_of(words)
+    tones, offsets, samples = axis.tones, axis.offsets, space.work[SAMPLES]
     shared, first, last = envelope(tones, offsets[i], offsets[i + 1])
-    slope = (last - first) / length[i]
-    strip, n_samples = strip_samples(block), at[i + 1] - at[i]
-    for s in range(skip // strip, (skip + len(out) - 1) // strip + 1):
-        x = s * strip + delta[i]
-        start, stop = max(0, skip - s * strip), min(strip, skip + len(out) - s * strip)
-        if not is_there(workspace[6], STRIP_KEYS, number, i, s):
-            whole = min(strip, n_samples - s * strip)
-            work[SAMPLES, :whole] = np.float32(0.0)
-            for k in range(offsets[i], offsets[i + 1]):
-                add_direct(axis, i, k, x, whole, shared, workspace)
-            if first != last:
-                apply_envelope(work[SAMPLES], whole, first + slope * x, slope)
-        store(out[s * strip + start - skip :], stop - start, work[SAMPLES], start)
+    slope, n_samples = (last - first) / axis.length[i], axis.first[i + 1] - axis.first[i]
+    for s in range(skip // STRIP, (skip + len(out) - 1) // STRIP + 1):
+        x = s * STRIP + axis.delta[i]
+        start, stop = max(0, skip - s * STRIP), min(STRIP, skip + len(out) - s * STRIP)
+        if not is_there(space.keys, STRIP_KEYS, words[NUMBER], i, s):
+            whole = min(STRIP, n_samples - s * STRIP)
+            samples[:whole] = np.float32(0.0)
+            for steady in (False, True):
+                if steady and first != last:
+                    apply_envelope(samples, whole, first + slope * x, slope)
+                for k in range(offsets[i], offsets[i + 1]):
+                    if is_steady(tones, k) == steady:
+                        add_direct(words, i, k, x, whole, shared)
+        store(out[s * STRIP + start - skip :], stop - start, samples, start)
 
 
-@helper_kernel(f"void({AXIS}, int64, int16[::1], {WORKSPACE})")
-def render(axis: Axis, start: int, out: NDArray[np.int16], workspace: Workspace) -> None:
-    """Render samples ``start`` to ``start + len(out)`` of an axis; beyond its end they are 0."""
-    path, first = axis[3], axis[7]
-    stop = start + len(out)
-    i = int(np.searchsorted(first, start, "right")) - 1
-    at = start
-    while at < stop and i < len(path):
+@kernel("int64(int64, int64, int64)")
+def render_at(address: int, start: int, out_address: int) -> int:
+    """Render samples of an axis; beyond its end they are 0.
+
+    Args:
+        address: Of the words of the axis and of a workspace, of which N_OUT is the number of samples.
+        start: First sample.
+        out_address: Address of the result, int16 (N_OUT,).
+
+    Returns:
+        0.
+    """
+    words = carray(pointer(address), N_WORDS, np.int64)
+    axis, out = axis_of(words), carray(pointer(out_address), words[N_OUT], np.int16)
+    path, first = axis.path, axis.first
+    at, stop, i = start, start + len(out), int(np.searchsorted(first, start, "right")) - 1
+    while at < stop and i < words[N_SEGMENTS]:
         until = min(stop, first[i + 1])
         if at < until:
             piece = out[at - start : until - start]
             if path[i] == SILENT:
                 piece[:] = 0
             elif path[i] == DIRECT:
-                render_direct(axis, i, at - first[i], piece, workspace)
+                render_direct(words, i, at - first[i], piece)
             else:
-                render_comb(axis, i, at - first[i], piece, workspace)
+                render_comb(words, i, at - first[i], piece)
             at = until
         i += 1
     out[at - start :] = 0
-
-
-N_OUT: Final = 0
-"""The word of an axis that says how many samples :func:`render_at` renders."""
-_SIZES: Final = 1  # tones, segments, rows of the teeth, period, block, number, width of the workspace
-_STEP: Final = 8
-_ARRAYS: Final = 9  # addresses of ten arrays of the axis and nine of the workspace
-N_WORDS: Final = _ARRAYS + 19
-
-
-@kernel(f"int64({AXIS}, {WORKSPACE}, int16[::1], int64[::1])")
-def describe(axis: Axis, workspace: Workspace, out: NDArray[np.int16], words: NDArray[np.int64]) -> int:
-    """Fill in what :func:`render_at` needs, int64 (N_WORDS,); axis and workspace must live as long.
-
-    Returns:
-        The address of ``out``.
-    """
-    words[N_OUT] = len(out)
-    tones, offsets, course, path, tooth, group, teeth, first, delta, length, step, block, number = axis
-    sums, work, tables, lanes, state, chirps, keys, nodes, repeated = workspace
-    words[_SIZES], words[_SIZES + 1] = tones.shape[1], len(path)
-    words[_SIZES + 2], words[_SIZES + 3] = teeth.shape
-    words[_SIZES + 4], words[_SIZES + 5], words[_SIZES + 6] = block, number, work.shape[1]
-    words.view(np.float64)[_STEP] = step
-    at = words[_ARRAYS:]
-    at[0], at[1], at[2], at[3] = tones.ctypes.data, offsets.ctypes.data, course.ctypes.data, path.ctypes.data
-    at[4], at[5], at[6], at[7] = tooth.ctypes.data, group.ctypes.data, teeth.ctypes.data, first.ctypes.data
-    at[8], at[9], at[10], at[11] = delta.ctypes.data, length.ctypes.data, sums.ctypes.data, work.ctypes.data
-    at[12], at[13], at[14] = tables.ctypes.data, lanes.ctypes.data, state.ctypes.data
-    at[15], at[16], at[17] = chirps.ctypes.data, keys.ctypes.data, nodes.ctypes.data
-    at[18] = repeated.ctypes.data
-    return out.ctypes.data  # pyright: ignore[reportReturnType]
-
-
-@kernel("int64(int64, int64, int64)")
-def render_at(address: int, start: int, out: int) -> int:
-    """:func:`render` with the addresses of all arrays.
-
-    Args:
-        address: Of the words of an axis, of which N_OUT is the number of samples.
-        start: First sample.
-        out: Address of the result, int16 (N_OUT,).
-
-    Returns:
-        0.
-    """
-    words = carray(pointer(address), N_WORDS, np.int64)
-    n_tones, n, n_teeth, period = words[_SIZES], words[_SIZES + 1], words[_SIZES + 2], words[_SIZES + 3]
-    block, number, width, at = words[_SIZES + 4], words[_SIZES + 5], words[_SIZES + 6], words[_ARRAYS:]
-    axis = (
-        carray(pointer(at[0]), (N_FIELDS, n_tones), np.float64),
-        carray(pointer(at[1]), n + 1, np.int32),
-        carray(pointer(at[2]), n, np.int8),
-        carray(pointer(at[3]), n, np.int8),
-        carray(pointer(at[4]), n_tones, np.int32),
-        carray(pointer(at[5]), n_tones, np.int8),
-        carray(pointer(at[6]), (n_teeth, period), np.float64),
-        carray(pointer(at[7]), n + 1, np.int64),
-        carray(pointer(at[8]), n, np.float64),
-        carray(pointer(at[9]), n, np.float64),
-        words.view(np.float64)[_STEP],
-        block,
-        number,
-    )
-    workspace = (
-        carray(pointer(at[10]), (N_ROWS64, width), np.float64),
-        carray(pointer(at[11]), (N_ROWS32, width), np.float32),
-        carray(pointer(at[12]), (MAX_GROUPS, N_SUMS, width), np.float32),
-        carray(pointer(at[13]), (MAX_GROUPS, 4, LANES + 1), np.float64),
-        carray(pointer(at[14]), (MAX_GROUPS, N_STATE), np.float64),
-        carray(pointer(at[15]), (N_CHIRPS, 2, width), np.float32),
-        carray(pointer(at[16]), N_KEYS, np.float64),
-        carray(pointer(at[17]), (3, width // LANES), np.int32),
-        carray(pointer(at[18]), width, np.int16),
-    )
-    render(axis, start, carray(pointer(out), words[N_OUT], np.int16), workspace)
     return 0
 
 
 @kernel("int64(int64, int64, int64)", for_c=True)
-def render_for_c(address: int, start: int, out: int) -> int:
+def render_for_c(address: int, start: int, out_address: int) -> int:
     """:func:`render_at`, for code in C."""
-    return render_at(address, start, out)
+    return render_at(address, start, out_address)

@@ -26,20 +26,20 @@ if TYPE_CHECKING:
 
 
 BLOCK: Final = 1536
-"""Smallest size of a block, in samples."""
+"""Smallest size of a block, in samples: in four periods of 390 tones half-way between sites repeat, too."""
+
+TEETH: Final = 8
+"""Tables of teeth are made for so many at a time, so that the next program finds those of the one before."""
+
+MIN_PERIOD: Final = 128
+"""Shortest period of a table, in samples."""
 
 MIN_REUSED: Final = 1 << 19
 MAX_REUSED: Final = 1 << 26
 """Samples of both channels, of waveforms whose memory :func:`render` uses again: 1 to 128 MB."""
 
-BLOCK_AT: Final = 11
-"""Where an axis has the samples of a block."""
-
 _NUMBERS: Final = count()
 
-
-NO_SAMPLES: Final = np.empty(0, np.int16)
-"""Lives as long as the process: programs for kernels hold its address."""
 
 _FREE_SAMPLES: Final[deque[NDArray[np.int16]]] = deque(maxlen=2)
 
@@ -49,14 +49,13 @@ class Comb:
     """The comb of an axis at a sample rate.
 
     Attributes:
-        origin: Frequency of the first tooth, in cycles per sample.
+        first: Number of the first tooth; tooth 0 is 0 Hz.
         step: Spacing of the teeth, in cycles per sample; ``step * period`` is whole.
-        teeth: float64 (2 n_teeth, period), cosine and sine of each tooth's
-            distance from the first; of no length if there is no comb.
-        block: Samples that are rendered at a time, a multiple of the period.
+        teeth: float64 (2 n_teeth, period), cosine and sine of each tooth; of no length if there is no comb.
+        block: Samples after which parked tones may repeat themselves, a multiple of the period.
     """
 
-    origin: float
+    first: int
     step: float
     teeth: NDArray[np.float64]
     block: int
@@ -67,7 +66,7 @@ class Comb:
         return len(self.teeth) // 2
 
 
-NO_COMB: Final = Comb(0.0, 1.0, np.empty((0, 0)), 1024)
+NO_COMB: Final = Comb(0, 1.0, np.empty((0, 0)), 1024)
 
 
 def comb_sample_rate(
@@ -123,7 +122,7 @@ def find_comb(spacing: float, lowest_hz: float, span_hz: float, sample_rate_hz: 
         span_hz: Distance of the last one.
         sample_rate_hz: Sample rate.
     """
-    from labseq.motion.render_comb_kernels import MAX_TEETH, TOLERANCE_HZ
+    from labseq.motion.comb_kernels import MAX_TEETH, TOLERANCE_HZ
 
     if spacing < 0.0:
         return NO_COMB
@@ -131,14 +130,16 @@ def find_comb(spacing: float, lowest_hz: float, span_hz: float, sample_rate_hz: 
     if spacing == 0.0:  # then it may as well be on a tooth of 0 Hz's comb, and repeat itself
         spacing = sample_rate_hz / _ratio(origin).denominator
     ratio = _ratio(spacing / sample_rate_hz)
-    period, step = ratio.denominator, float(ratio)
+    periods = math.ceil(MIN_PERIOD / ratio.denominator)
+    period, step = periods * ratio.denominator, float(ratio)
     span = span_hz / sample_rate_hz
     near = abs(step * sample_rate_hz - spacing) <= TOLERANCE_HZ
     if step <= 0.0 or not near or round(span / step) >= MAX_TEETH:
         return NO_COMB
-    n_teeth = round(span / step) + 1
-    teeth = _teeth(ratio.numerator, period, 1 << (n_teeth - 1).bit_length())
-    return Comb(origin, step, teeth[: 2 * n_teeth], period * math.ceil(BLOCK / period))
+    first = math.floor(origin / step) // TEETH * TEETH
+    n_teeth = math.ceil((math.floor((origin + span) / step) + 2 - first) / TEETH) * TEETH
+    teeth = _teeth(periods * ratio.numerator, period, first, n_teeth)
+    return Comb(first, step, teeth, period * math.ceil(BLOCK / period))
 
 
 @lru_cache(maxsize=64)
@@ -148,13 +149,13 @@ def _ratio(value: float) -> Fraction:
 
 
 @lru_cache(maxsize=8)
-def _teeth(numerator: int, period: int, n_teeth: int) -> NDArray[np.float64]:
+def _teeth(numerator: int, period: int, first: int, n_teeth: int) -> NDArray[np.float64]:
     """The array :attr:`Comb.teeth`, cached for the next program."""
-    from labseq.motion.render_comb_kernels import fill_teeth
+    from labseq.motion.comb_kernels import fill_teeth
 
     angles = 2 * np.pi / period * np.arange(period)
     teeth = np.empty((2 * n_teeth, period))
-    fill_teeth(np.cos(angles), np.sin(angles), numerator, teeth)
+    fill_teeth(np.cos(angles), np.sin(angles), numerator, first, teeth)
     teeth.flags.writeable = False
     return teeth
 
@@ -176,12 +177,12 @@ MAX_SAMPLES: Final = 2**53
 """Largest number of samples that float64 counts exactly."""
 
 MAX_WORKSPACES: Final = 8
-"""Number of workspaces kept for rendering threads, 2 MB each."""
+"""Number of workspaces kept for rendering threads, up to 9 MB each."""
 
 
 def warm_rendering() -> None:
     """Compile the kernels of rendering, or load them from the cache; for drivers that play samples."""
-    for kernels in ("render_direct_kernels", "render_comb_kernels"):
+    for kernels in ("comb_kernels", "render_direct_kernels", "render_group_kernels"):
         importlib.import_module(f"labseq.motion.{kernels}")
 
 
@@ -190,9 +191,9 @@ class RenderPath(IntEnum):
 
     Attributes:
         SILENT: There are none, or all have amplitude 0.
-        COMB: They start on the teeth of one comb, in at most three groups that share a
-            chirp: left-moving, right-moving, parked. The cost per sample does not grow
-            with their number.
+        COMB: In at most four groups that share a chirp, such as left-moving, right-moving, parked, each
+            on a comb of one spacing; of parked tones some may be ramped together. The cost per sample does
+            not grow with their number.
         BLENDED: The same, but amplitudes that change by different factors, or tones a
             little beside their teeth, are followed by a cubic in time: four tables per
             group are blended. Worth it if all cubics together err by less than 1e-7 of
@@ -251,8 +252,8 @@ class Renderer:
         for array in (self.first_sample, delta, length):
             array.flags.writeable = False
         axes = [_prepare(program, channel, times, self.sample_rate_hz) for channel in range(N_CHANNELS)]
-        self._axes: list[Axis] = axes
-        self.path = np.stack([axis[3] for axis in axes])
+        self._axes = axes
+        self.path = np.stack([axis.arrays.path for axis in axes])
         self.path.flags.writeable = False
 
     def write(self, channel: int, start: int, out: NDArray[np.int16]) -> None:
@@ -266,17 +267,18 @@ class Renderer:
             start: First sample, counted from the start of the program.
             out: Result, int16 (n,), contiguous.
         """
-        from labseq.motion.render_direct_kernels import N_WORDS, describe, render_at
-        from labseq.motion.render_kernels import new_workspace
+        from labseq.motion.render_direct_kernels import render_at
+        from labseq.motion.render_kernels import N_OUT, Workspace
 
-        axis, words = self._axes[channel], np.empty(N_WORDS, np.int64)
-        free = _free_workspaces(axis[BLOCK_AT])
+        axis = self._axes[channel]
+        free = _free_workspaces(axis.block)
         try:
             workspace = free.pop()
         except IndexError:
-            workspace = new_workspace(axis[BLOCK_AT])
-        place = describe(axis, workspace, out, words)
-        render_at(words.ctypes.data, start, place)
+            workspace = Workspace(axis.block)
+        words = np.concatenate([axis.words, workspace.words])
+        words[N_OUT] = len(out)
+        render_at(words.ctypes.data, start, out.ctypes.data)
         free.append(workspace)
 
     def words(self, workspaces: dict[tuple[int, int], Workspace]) -> NDArray[np.int64]:
@@ -286,15 +288,13 @@ class Renderer:
             workspaces: Those of the thread that renders, by channel and size of block; the kernel uses them,
                 and what is missing is added. They and the renderer must live as long as the kernel renders.
         """
-        from labseq.motion.render_direct_kernels import N_WORDS, describe
-        from labseq.motion.render_kernels import new_workspace
+        from labseq.motion.render_kernels import N_WORDS, Workspace
 
         words = np.zeros((N_CHANNELS, N_WORDS), np.int64)
         for channel, axis in enumerate(self._axes):
-            block = axis[BLOCK_AT]
-            if (channel, block) not in workspaces:
-                workspaces[channel, block] = new_workspace(block)
-            describe(axis, workspaces[channel, block], NO_SAMPLES, words[channel])
+            if (channel, axis.block) not in workspaces:
+                workspaces[channel, axis.block] = Workspace(axis.block)
+            words[channel] = np.concatenate([axis.words, workspaces[channel, axis.block].words])
         return words
 
 
@@ -370,49 +370,64 @@ def _write_channels(renderer: Renderer, start: int, out: NDArray[np.int16]) -> N
         renderer.write(channel, start, out[channel])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Axis:
+    """An axis as kernels see it.
+
+    Attributes:
+        block: Samples of a block.
+        words: int64 (WIDTH,), see :data:`labseq.motion.render_kernels.N_WORDS`.
+        arrays: What is at the addresses in it.
+    """
+
+    block: int
+    words: NDArray[np.int64]
+    arrays: Axis
+
+
 def _prepare(
     program: ToneProgram,
     channel: int,
     times: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]],
     sample_rate_hz: float,
-) -> Axis:
+) -> _Axis:
     """Convert an axis to the kernels' units, and choose how each segment is rendered.
 
     Raises:
         LimitError: See :class:`Renderer`.
     """
-    from labseq.motion.render_comb_kernels import survey
-    from labseq.motion.render_kernels import FINE, N_FIELDS, choose_paths
+    from labseq.motion.comb_kernels import find_spacing
+    from labseq.motion.render_group_kernels import choose_paths
+    from labseq.motion.render_kernels import FINE, N_FIELDS, N_WAVE, Axis, take_tones
 
-    axis, (first_sample, delta, length) = (program.row, program.column)[channel], times
-    n_tones = len(axis.start_hz)
+    axis, n_segments = (program.row, program.column)[channel], program.n_segments
+    start_hz, end_hz, n_tones = axis.start_hz, axis.end_hz, len(axis.start_hz)
+    amplitudes, offsets = (axis.start_amplitude, axis.end_amplitude), axis.offsets
     tones, comb_hz = np.empty((N_FIELDS, n_tones)), np.zeros(3)
-    fault, index = survey(
-        axis.start_hz,
-        axis.end_hz,
-        axis.start_amplitude,
-        axis.end_amplitude,
-        axis.phase_rad,
-        axis.offsets,
-        sample_rate_hz,
-        tones,
-        comb_hz,
-    )
+    fault, index = take_tones(start_hz, end_hz, *amplitudes, axis.phase_rad, offsets, sample_rate_hz, tones)
     if fault != FINE:
         _refuse(fault, index, program, channel, sample_rate_hz)
+    find_spacing(start_hz, end_hz, offsets, comb_hz)
     spacing, lowest_hz, span_hz = comb_hz.tolist()
     comb = find_comb(spacing, lowest_hz, span_hz, sample_rate_hz)
-    path, group = np.empty(len(length), np.int8), np.zeros(n_tones, np.int8)
-    tooth = np.zeros(n_tones, np.int32)
-    choose_paths(
-        tones, axis.offsets, length, program.course, comb.origin, comb.step, comb.n_teeth, path, tooth, group
+    arrays = Axis(
+        tones,
+        offsets,
+        program.course,
+        *times,
+        comb.teeth,
+        path=np.empty(n_segments, np.int8),
+        squares=np.empty((2, n_segments)),
+        group=np.empty(n_tones, np.int8),
+        tooth=np.empty(n_tones, np.int32),
+        table=np.empty(n_tones, np.int32),
+        waves=np.empty((N_WAVE, n_tones)),
     )
-    for array in (tones, path, tooth, group):
-        array.flags.writeable = False
-    return (
-        tones, axis.offsets, program.course, path, tooth, group, comb.teeth, first_sample, delta, length,
-        comb.step, comb.block, next(_NUMBERS),
-    )  # fmt: skip
+    numbers = (0, n_tones, n_segments, comb.teeth.shape[1], comb.n_teeth, comb.first)
+    bits, addresses = np.float64(comb.step).view(np.int64), (array.ctypes.data for array in arrays)
+    words = np.array([*numbers, bits, comb.block, next(_NUMBERS), *addresses], np.int64)
+    choose_paths(words)
+    return _Axis(comb.block, words, arrays)
 
 
 def _refuse_durations(program: ToneProgram, sample_rate_hz: float) -> NoReturn:

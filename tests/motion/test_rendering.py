@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 import labseq
 from labseq.errors import LimitError
-from labseq.model import Batch, FrequencyCourse, MotionSpec, Plan, SiteGrid, ToneProgram
+from labseq.model import Batch, FrequencyCourse, MotionSpec, Plan, SiteGrid, TonePaths, ToneProgram
 from labseq.motion import tone_program
 from labseq.motion.render_reference import render_reference
 from labseq.motion.rendering import MAX_WORKSPACES, Renderer, RenderPath, comb_sample_rate, render
@@ -123,14 +124,48 @@ def test_a_sample_rate_that_misses_the_comb_by_a_clock_step_is_made_up_for() -> 
     check(program, rate_hz)
 
 
+def weaving() -> TonePaths:
+    """Columns that go up, that wait and that go down in a lane, and rows that are dropped off in turn.
+
+    All swing to and fro on their way.
+    """
+    parts = np.arange(1, 17)
+    swing = np.where(parts % 4, 0.11 * np.sin(np.pi * parts / 4), 0.0)
+    ways = [parts / 8 - swing / 2, swing, np.clip(parts - 4, 0, 8) / -8 + swing]
+    column = 0.5 + np.array([1.0, 4.0, 7.0, 10.0]) + np.array([ways[0], ways[0], ways[1], ways[2]]).T
+    row = 0.5 + np.array([0.0, 2.0, 5.0]) + swing[:, None]
+    column = np.vstack(
+        [[1, 4, 7, 10], [1.5, 4.5, 7.5, 10.5], column, [3, 6, 7, 9], [3.5, 6.5, 7.5, 9.5], [3, 6, 7, 9]]
+    )
+    row = np.vstack([[0, 2, 5], [0.5, 2.5, 5.5], row, [0, 2.5, 5.5], [0, 2.5, 5.5], [0, 2, 5]])
+    return TonePaths(row, column, np.array([18, 20, 20]))
+
+
+@pytest.mark.parametrize("sample_rate_hz", [COMB_HZ, 625e6])
+@pytest.mark.parametrize("uneven", [False, True])
+def test_paths_through_lanes_are_rendered_in_groups(uneven: bool, sample_rate_hz: float) -> None:
+    moves = np.array([[0, 1]]), np.array([[0, 3]])
+    plan = Plan.from_batches([Batch(*moves, tones=weaving())] * 2)
+    amplitudes = tuple(0.045 + 0.002 * (np.arange(20) % 3)) if uneven else ()
+    motion = MotionSpec(overhead_per_batch_s=1e-6, rf=replace(MotionSpec().rf, column_amplitudes=amplitudes))
+    program = tone_program(plan, SiteGrid(), motion)
+    paths = Renderer(program, sample_rate_hz).path
+    assert set(paths[0]) == {SILENT, COMB}
+    assert set(paths[1]) == ({SILENT, COMB, BLENDED} if uneven else {SILENT, COMB})
+    check(program, sample_rate_hz)
+
+
 TONE = st.tuples(
-    st.integers(0, 21), st.integers(-3, 3), st.sampled_from([0.0, 0.03, 0.0301, 0.05]), st.floats(-7, 7)
+    st.sampled_from([0, 1, 2, 5, 9, 9.5, 10.5, 12.125, 13.125, 20]),
+    st.sampled_from([-3, -0.5, 0, 0, 0.125, 1]),
+    st.sampled_from([0.0, 0.03, 0.0301, 0.05]),
+    st.floats(-7, 7),
 )
 
 
 @given(
     segments=st.lists(
-        st.tuples(st.floats(0, 8e-6), st.lists(TONE, max_size=6), st.booleans()), min_size=1, max_size=5
+        st.tuples(st.floats(0, 14e-6), st.lists(TONE, max_size=6), st.booleans()), min_size=1, max_size=5
     ),
     course=st.sampled_from(FrequencyCourse),
     off_hz=st.sampled_from([0.0, 0.3, 40.0, 1e4]),
@@ -144,9 +179,10 @@ def test_any_program_is_rendered_right_in_chunks_of_any_size(
     made: list[Segment] = []
     for duration_s, tones, ramped in segments:
         rows: list[tuple[float, float, float, float, float]] = []
-        for index, by, amplitude, phase_rad in tones:
+        for number, (index, by, amplitude, phase_rad) in enumerate(tones):
             start_hz = site(index) + off_hz * phase_rad
-            rows.append((start_hz, start_hz + by * STEP_HZ, 0.0 if ramped else amplitude, 0.05, phase_rad))
+            start, end = (0.0 if ramped else amplitude), (amplitude if ramped and number % 2 else 0.05)
+            rows.append((start_hz, start_hz + by * STEP_HZ, end if number % 2 else start, end, phase_rad))
         made.append((duration_s, rows))
     program = program_of(*made, course=course, still=False)
     samples = check(program, sample_rate_hz)
