@@ -33,18 +33,14 @@ from labseq.kernels.kernel import helper_kernel
 from labseq.motion.render_group_kernels import envelope, fit_cubic, next_of_group, off_tooth, segment_of
 from labseq.motion.render_kernels import (
     BLENDED,
-    BLENDED_ROW,
     BLOCK,
     CHIRP,
     CHUNK,
-    CUBIC_ROW,
     END_AMPLITUDE,
     F32,
-    F64,
     FIRST_TOOTH,
     FREQUENCY,
     FULL_SCALE,
-    LANE_ROW,
     N_COEFFICIENTS,
     N_TABLES,
     NUMBER,
@@ -52,16 +48,13 @@ from labseq.motion.render_kernels import (
     PERIOD,
     PHASE,
     PHASE_SINCE,
-    SAMPLES,
     SINCE,
     START_AMPLITUDE,
     STEADY,
     STEP,
     STRIP,
-    STRIP_KEYS,
-    TABLE_KEYS,
-    WAVE_ROW,
     WORDS,
+    Complex,
     Words,
     add_tooth,
     apply_envelope,
@@ -80,7 +73,6 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 
-Complex = tuple[float, float]
 COMPLEX: Final = "UniTuple(float64, 2)"
 
 
@@ -152,7 +144,7 @@ def add_moving(
     f"void(float32[:, ::1], int64, int64, {COMPLEX}, float64, float64, float32[:, ::1])", fused=True
 )
 def blend(
-    tables: Singles, n: int, period: int, by: Complex, u: float, per_sample: float, work: Singles
+    tables: Singles, n: int, period: int, by: Complex, u: float, per_sample: float, blended: Singles
 ) -> None:
     """Blend tables by a cubic in the time since the start of the segment, for ``n`` samples of a strip.
 
@@ -163,13 +155,13 @@ def blend(
         by: By which they are multiplied from period to period.
         u: Fraction of the segment that has passed at the first sample.
         per_sample: What is added from sample to sample.
-        work: Of the workspace. The result is its two rows from BLENDED_ROW on.
+        blended: Result, float32 (2, >= n + CHUNK).
     """
     x, y, offset = 1.0, 0.0, 0
     slope = np.float32(per_sample)
     for q in range((n + CHUNK - 1) // CHUNK):
         first, now_re, now_im = np.float32(u + per_sample * (q * CHUNK)), np.float32(x), np.float32(y)
-        re, im = work[BLENDED_ROW, q * CHUNK :], work[BLENDED_ROW + 1, q * CHUNK :]
+        re, im = blended[0, q * CHUNK :], blended[1, q * CHUNK :]
         for part, out in ((0, re), (1, im)):
             c0, c1 = tables[part, offset:], tables[part + 2, offset:]
             c2, c3 = tables[part + 4, offset:], tables[part + 6, offset:]
@@ -192,8 +184,8 @@ def add_to_sums(words: Words, i: int, k: int, anchor: int, shared: bool, n_sums:
 
     ``anchor`` is the first tone of its group.
     """
-    axis, sums, step = axis_of(words), space_of(words).scratch, words.view(np.float64)[STEP]
-    tones, tooth, re, im = axis.tones, int(axis.tooth[k]), sums[CUBIC_ROW], sums[CUBIC_ROW + 1]
+    axis, space, step = axis_of(words), space_of(words), words.view(np.float64)[STEP]
+    tones, tooth, re, im = axis.tones, int(axis.tooth[k]), space.cubic[0], space.cubic[1]
     a, b = tones[START_AMPLITUDE, k], tones[END_AMPLITUDE, k]
     if shared:
         a = b = max(a, b)
@@ -201,7 +193,7 @@ def add_to_sums(words: Words, i: int, k: int, anchor: int, shared: bool, n_sums:
         re[0], im[0] = a, 0.0
     else:
         drift, bend = off_tooth(tones, k, anchor, tooth - axis.tooth[anchor], step, axis.length[i])
-        fit_cubic(a, b, drift, bend, re[:N_COEFFICIENTS], im[:N_COEFFICIENTS])
+        fit_cubic(a, b, drift, bend, re, im)
     x, y = turn(tones[PHASE, k] + step * tooth * axis.delta[i])
     cosine, sine = (
         axis.teeth[2 * (tooth - words[FIRST_TOOTH])],
@@ -210,14 +202,14 @@ def add_to_sums(words: Words, i: int, k: int, anchor: int, shared: bool, n_sums:
     for power in range(n_sums):
         w_re = FULL_SCALE * (x * re[power] - y * im[power])
         w_im = FULL_SCALE * (x * im[power] + y * re[power])
-        add_tooth(cosine, sine, w_re, w_im, sums[2 * power], sums[2 * power + 1])
+        add_tooth(cosine, sine, w_re, w_im, space.total[2 * power], space.total[2 * power + 1])
 
 
-@helper_kernel(f"int64({F64}, int64, int64)")
-def find_sums(keys: Floats, number: int, anchor: int) -> int:
+@helper_kernel("int64(int64[:, ::1], int64, int64)")
+def find_sums(keys: Words, number: int, anchor: int) -> int:
     """Where the sums of a group are in the workspace, by its first tone; -1 if they are not there."""
     for at in range(N_TABLES):
-        if keys[TABLE_KEYS + 3 * at] == number and keys[TABLE_KEYS + 3 * at + 1] == anchor:
+        if keys[at, 0] == number and keys[at, 1] == anchor:
             return at
     return -1
 
@@ -225,20 +217,20 @@ def find_sums(keys: Floats, number: int, anchor: int) -> int:
 @helper_kernel(f"void({WORDS}, int64)")
 def find_all_sums(words: Words, i: int) -> None:
     """Fill in the sums of the groups of segment ``i`` that are not in the workspace."""
-    axis, keys, number = axis_of(words), space_of(words).keys, words[NUMBER]
+    axis, keys, number = axis_of(words), space_of(words).sum_keys, words[NUMBER]
     table = axis.table[axis.offsets[i] : axis.offsets[i + 1]]
     for anchor in table:
         at = find_sums(keys, number, anchor) if anchor >= 0 else -1
         if at >= 0:
-            keys[TABLE_KEYS + 3 * at + 2] = i
+            keys[at, 2] = i
     for anchor in table:
         if anchor < 0 or find_sums(keys, number, anchor) >= 0:
             continue
-        at = int(keys[TABLE_KEYS - 1])
-        while keys[TABLE_KEYS + 3 * at] == number and keys[TABLE_KEYS + 3 * at + 2] == i:
+        at = keys[N_TABLES, 0]
+        while keys[at, 0] == number and keys[at, 2] == i:  # the segment needs it, too
             at = (at + 1) % N_TABLES
-        keys[TABLE_KEYS + 3 * at], keys[TABLE_KEYS + 3 * at + 1] = number, anchor
-        keys[TABLE_KEYS + 3 * at + 2], keys[TABLE_KEYS - 1] = i, (at + 1) % N_TABLES
+        keys[at, 0], keys[at, 1], keys[at, 2] = number, anchor, i
+        keys[N_TABLES, 0] = (at + 1) % N_TABLES
         fill_sums(words, anchor, at)
 
 
@@ -251,53 +243,39 @@ def fill_sums(words: Words, anchor: int, at: int) -> None:
     axis, space, period = axis_of(words), space_of(words), words[PERIOD]
     i = segment_of(axis, anchor)
     k, stop, n_sums = anchor, axis.offsets[i + 1], N_COEFFICIENTS if axis.path[i] == BLENDED else 1
-    space.scratch[: 2 * n_sums, :period] = 0.0
+    space.total[: 2 * n_sums, :period] = 0.0
     shared, _, _ = envelope(axis.tones, axis.offsets[i], stop)
     while k < stop:
         add_to_sums(words, i, k, anchor, shared, n_sums)
         k = next_of_group(axis.group, axis.group[anchor], k + 1, stop)
     for row in range(2 * n_sums):
-        once, twice, total = space.sums[at, row], space.sums[at, row, period:], space.scratch[row]
+        once, twice, total = space.sums[at, row], space.sums[at, row, period:], space.total[row]
         for j in range(period):
             once[j] = np.float32(total[j])
         for j in range(min(period, STRIP) + 2 * CHUNK):
             twice[j] = once[j]
 
 
-@helper_kernel(
-    "void(float32[:, ::1], int64, int64, int64, float64, float64, float64, float64[:, ::1],"
-    " float32[:, ::1], float32[:, ::1])",
-    fused=True,
-)
-def fill_tables(
-    sums: Singles,
-    n_sums: int,
-    first: int,
-    n: int,
-    sign: float,
-    phase: float,
-    frequency: float,
-    scratch: Floats,
-    work: Singles,
-    tables: Singles,
+@helper_kernel(f"void({WORDS}, int64, int64, int64, int64, float64, float64, float64)", fused=True)
+def fill_table(
+    words: Words, at: int, n_sums: int, first: int, n: int, sign: float, phase: float, frequency: float
 ) -> None:
     """Multiply sums by exp 2 pi i (phase + frequency j), j = 0 ... n - 1, and conjugate if ``sign`` is -1.
 
     Args:
-        sums: float32 (N_SUMS, ...), real and imaginary part of each.
-        n_sums: How many.
+        words: Of axis and workspace, whose table is the result.
+        at: Number of the sums in the workspace.
+        n_sums: How many there are.
         first: Where j is 0.
         n: How many samples; there is room for CHUNK more.
         sign: 1 or -1.
         phase: In cycles.
         frequency: In cycles per sample.
-        scratch: Of the workspace.
-        work: Likewise.
-        tables: Result, float32 (N_SUMS, ...).
     """
-    lane_re, lane_im = scratch[LANE_ROW, :CHUNK], scratch[LANE_ROW + 1, :CHUNK]
+    space = space_of(words)
+    sums, tables, lane_re, lane_im = space.sums[at], space.table, space.lanes[0], space.lanes[1]
     by_re, by_im = fill_powers(sign * frequency, lane_re, lane_im)
-    wave_re, wave_im = work[WAVE_ROW], work[WAVE_ROW + 1]
+    wave_re, wave_im = space.wave[0], space.wave[1]
     for r in range(CHUNK):
         wave_re[r] = np.float32(lane_re[r])
     for r in range(CHUNK):
@@ -305,11 +283,11 @@ def fill_tables(
     x, y = turn(sign * phase)
     side = np.float32(sign)
     for q in range((n + CHUNK - 1) // CHUNK):
-        at = q * CHUNK
+        start = q * CHUNK
         a, b = np.float32(x), np.float32(y)
         for row in range(0, 2 * n_sums, 2):
-            re, im = sums[row, first + at :], sums[row + 1, first + at :]
-            out_re, out_im = tables[row, at:], tables[row + 1, at:]
+            re, im = sums[row, first + start :], sums[row + 1, first + start :]
+            out_re, out_im = tables[row, start:], tables[row + 1, start:]
             for r in range(CHUNK):
                 w_re, w_im = a * wave_re[r] - b * wave_im[r], a * wave_im[r] + b * wave_re[r]
                 out_re[r] = re[r] * w_re - side * im[r] * w_im
@@ -346,25 +324,23 @@ def add_group(
         u: Fraction of the segment that has passed at the first sample.
         per_sample: What is added to it from sample to sample; 0 if the group is not blended.
     """
-    space, period, by = space_of(words), words[PERIOD], (1.0, 0.0)
-    sums, work, tables, scratch = space.sums[at], space.work, space.table, space.scratch
-    acc = work[SAMPLES]
+    space, period = space_of(words), words[PERIOD]
+    acc, n_sums = space.samples, 1 if per_sample == 0.0 else N_COEFFICIENTS
     if chirp == 0.0 and abs(frequency) < STILL and per_sample == 0.0:
         now = turn(phase + 0.5 * frequency * n)
-        add_parked(acc, n, sums[0], sums[1], offset, period, now, by)
+        add_parked(acc, n, space.sums[at, 0], space.sums[at, 1], offset, period, now, (1.0, 0.0))
         return
-    n_sums, sign = 1 if per_sample == 0.0 else N_COEFFICIENTS, math.copysign(1.0, chirp)
     # the real part is that of the conjugate, so that a chirp serves both directions
-    fill_tables(sums, n_sums, offset, min(period, n) + CHUNK, sign, phase, frequency, scratch, work, tables)
-    by = turn(sign * frequency * period)
-    re, im = tables[0], tables[1]
+    sign = math.copysign(1.0, chirp)
+    fill_table(words, at, n_sums, offset, min(period, n) + CHUNK, sign, phase, frequency)
+    re, im, by = space.table[0], space.table[1], turn(sign * frequency * period)
     if per_sample != 0.0:
-        blend(tables, n, period, by, u, per_sample, work)
-        re, im, period, by = work[BLENDED_ROW], work[BLENDED_ROW + 1], n + CHUNK, (1.0, 0.0)
+        blend(space.table, n, period, by, u, per_sample, space.blended)
+        re, im, period, by = space.blended[0], space.blended[1], n + CHUNK, (1.0, 0.0)
     if chirp == 0.0:
         add_parked(acc, n, re, im, 0, period, (1.0, 0.0), by)
         return
-    c = find_chirp(abs(chirp), space.chirps, space.keys, scratch[LANE_ROW:])
+    c = find_chirp(abs(chirp), space.chirps, space.chirp_keys, space.lanes)
     add_moving(acc, n, re, im, period, by, space.chirps[c, 0], space.chirps[c, 1])
 
 
@@ -372,7 +348,7 @@ def add_group(
 def fill_strip(words: Words, i: int, start: int, n: int) -> None:
     """Fill in ``n`` samples of segment ``i`` from ``start`` on, those of steady tones after the envelope."""
     axis, space = axis_of(words), space_of(words)
-    waves, acc, keys, length = axis.waves, space.work[SAMPLES], space.keys, axis.length[i]
+    waves, acc, length = axis.waves, space.samples, axis.length[i]
     x, slope = start + axis.delta[i], (axis.squares[1, i] - axis.squares[0, i]) / length
     per_sample = 1.0 / length if axis.path[i] == BLENDED else 0.0
     acc[:n] = np.float32(0.0)
@@ -385,7 +361,7 @@ def fill_strip(words: Words, i: int, start: int, n: int) -> None:
             frequency, chirp = waves[FREQUENCY, k], waves[CHIRP, k]
             phase = waves[PHASE_SINCE, k] + x * (frequency + 0.5 * chirp * x)
             offset = (int(waves[SINCE, k]) + start) % words[PERIOD]
-            at = find_sums(keys, words[NUMBER], axis.table[k])
+            at = find_sums(space.sum_keys, words[NUMBER], axis.table[k])
             add_group(words, n, at, offset, phase, frequency + chirp * x, chirp, x * per_sample, per_sample)
 
 
@@ -413,16 +389,16 @@ def render_comb(words: Words, i: int, skip: int, out: NDArray[np.int16]) -> None
     on the stretch.
     """
     axis, space, number, block = axis_of(words), space_of(words), words[NUMBER], words[BLOCK]
-    keys, samples, n_samples = space.keys, space.work[SAMPLES], axis.first[i + 1] - axis.first[i]
+    n_samples = axis.first[i + 1] - axis.first[i]
     find_all_sums(words, i)
     if has_period(words, i):
-        if not is_there(keys, STRIP_KEYS, number, i, -1):
+        if not is_there(space.strip, number, i, -1):
             fill_strip(words, i, 0, block)
-            store(space.repeated, block, samples, 0)
+            store(space.repeated, block, space.samples, 0)
         repeat(out, skip, space.repeated, block)
         return
     for s in range(skip // STRIP, (skip + len(out) - 1) // STRIP + 1):
         start, end = max(0, skip - s * STRIP), min(STRIP, skip + len(out) - s * STRIP)
-        if not is_there(keys, STRIP_KEYS, number, i, s):  # a stretch that follows needs the rest
+        if not is_there(space.strip, number, i, s):  # a stretch that follows needs the rest
             fill_strip(words, i, s * STRIP, min(STRIP, n_samples - s * STRIP))
-        store(out[s * STRIP + start - skip :], end - start, samples, start)
+        store(out[s * STRIP + start - skip :], end - start, space.samples, start)

@@ -28,12 +28,10 @@ from labseq.motion.render_kernels import (
     N_WORDS,
     NUMBER,
     PHASE,
-    SAMPLES,
     SILENT,
     START,
     START_AMPLITUDE,
     STRIP,
-    STRIP_KEYS,
     WORDS,
     Words,
     apply_envelope,
@@ -260,7 +258,7 @@ def add_direct(words: Words, i: int, k: int, x: float, n: int, shared: bool) -> 
     """Add tone ``k`` of segment ``i`` to ``n`` samples, the first of them ``x`` samples after its start."""
     axis, space = axis_of(words), space_of(words)
     tones, length, kind = axis.tones, axis.length[i], axis.course[i]
-    acc, nodes = space.work[SAMPLES], space.nodes
+    acc, nodes = space.samples, space.nodes
     a, b = tones[START_AMPLITUDE, k], tones[END_AMPLITUDE, k]
     if shared:
         a = b = max(a, b)
@@ -282,13 +280,13 @@ def add_direct(words: Words, i: int, k: int, x: float, n: int, shared: bool) -> 
 def render_direct(words: Words, i: int, skip: int, out: NDArray[np.int16]) -> None:
     """Render a part of segment ``i`` tone by tone; see :func:`render_comb`."""
     axis, space = axis_of(words), space_of(words)
-    tones, offsets, samples = axis.tones, axis.offsets, space.work[SAMPLES]
+    tones, offsets, samples = axis.tones, axis.offsets, space.samples
     shared, first, last = envelope(tones, offsets[i], offsets[i + 1])
     slope, n_samples = (last - first) / axis.length[i], axis.first[i + 1] - axis.first[i]
     for s in range(skip // STRIP, (skip + len(out) - 1) // STRIP + 1):
         x = s * STRIP + axis.delta[i]
         start, stop = max(0, skip - s * STRIP), min(STRIP, skip + len(out) - s * STRIP)
-        if not is_there(space.keys, STRIP_KEYS, words[NUMBER], i, s):
+        if not is_there(space.strip, words[NUMBER], i, s):
             whole = min(STRIP, n_samples - s * STRIP)
             samples[:whole] = np.float32(0.0)
             for steady in (False, True):

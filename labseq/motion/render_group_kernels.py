@@ -155,8 +155,9 @@ def find_groups(words: Words, i: int, shared: bool, near: float, anchors: NDArra
                 continue
             nearest = int(tooth[anchor]) + int(np.rint((tones[START, k] - tones[START, anchor]) / step))
             drift, bend = off_tooth(tones, k, anchor, nearest - tooth[anchor], step, axis.length[i])
-            if its < 0 and abs(drift) <= near and abs(bend) <= near:
+            if abs(drift) <= near and abs(bend) <= near:
                 its, tooth[k] = g, nearest
+                break
         if its < 0:
             if n_groups == MAX_GROUPS:
                 return False

@@ -37,13 +37,6 @@ N_CHIRPS: Final = 32
 N_TABLES: Final = 8
 """Number of cached sums: twice the groups of a segment."""
 
-CHIRP_KEYS: Final = 1
-TABLE_KEYS: Final = CHIRP_KEYS + N_CHIRPS + 1
-STRIP_KEYS: Final = TABLE_KEYS + 3 * N_TABLES
-N_KEYS: Final = STRIP_KEYS + 3
-"""How many chirps were filled in, and each one; place of the next sums, and axis, first tone and segment that
-each is of; and of which axis, segment and strip the samples are."""
-
 CHIRP_GRID: Final = 2.0**62
 
 F32: Final = "float32[::1]"
@@ -136,7 +129,7 @@ def find_chirp(chirp: float, chirps: Singles, keys: Floats, lanes: Floats) -> in
     Args:
         chirp: In cycles per sample squared; rounded to a grid that makes no difference in a strip.
         chirps: float32 (N_CHIRPS, 2, >= STRIP + LANES), those that there are; updated.
-        keys: float64 (N_KEYS,), see there.
+        keys: float64 (N_CHIRPS + 1,), each of them, and how many were filled in; updated.
         lanes: Scratch, see :func:`fill_chirp`.
 
     Returns:
@@ -144,12 +137,12 @@ def find_chirp(chirp: float, chirps: Singles, keys: Floats, lanes: Floats) -> in
     """
     chirp = np.rint(chirp * CHIRP_GRID) / CHIRP_GRID
     for at in range(N_CHIRPS):
-        if keys[CHIRP_KEYS + at] == chirp:
+        if keys[at] == chirp:
             return at
-    at = int(keys[CHIRP_KEYS - 1]) % N_CHIRPS
+    at = int(keys[N_CHIRPS]) % N_CHIRPS
     fill_chirp(chirp, STRIP, chirps[at, 0], chirps[at, 1], lanes)
-    keys[CHIRP_KEYS + at] = chirp
-    keys[CHIRP_KEYS - 1] += 1.0
+    keys[at] = chirp
+    keys[N_CHIRPS] += 1.0
     return at
 
 
@@ -190,15 +183,6 @@ FULL_SCALE: Final = 32767.0
 N_SUMS: Final = 2 * N_COEFFICIENTS
 """Rows of a table: real and imaginary part of the coefficient of each power of the time."""
 
-SAMPLES: Final = 0  # rows of the second array of a Workspace
-BLENDED_ROW: Final = 1
-WAVE_ROW: Final = 3
-N_ROWS32: Final = 5
-
-CUBIC_ROW: Final = N_SUMS  # rows of the fourth, behind the sums
-LANE_ROW: Final = CUBIC_ROW + 2
-N_ROWS64: Final = LANE_ROW + 4
-
 N_OUT: Final = 0  # of the words of an axis: how many samples to render
 N_TONES: Final = 1
 N_SEGMENTS: Final = 2
@@ -211,7 +195,7 @@ NUMBER: Final = 8  # that no other axis has
 AXIS_AT: Final = 9  # addresses of the arrays of an Axis
 WIDTH: Final = 22  # of the workspace in which it is rendered
 SPACE_AT: Final = 23  # addresses of the arrays of its Space
-N_WORDS: Final = 31
+N_WORDS: Final = 37
 """Words, int64, that kernels get: to pass twenty arrays to each takes as long as to render 1000 samples."""
 
 Words = NDArray[np.int64]
@@ -279,21 +263,33 @@ class Space(NamedTuple):
 
     Attributes:
         sums: float32 (N_TABLES, N_SUMS, width), over two periods, or a period and a strip.
-        work: float32 (N_ROWS32, width): the samples, a blended table, a wave.
         table: float32 (N_SUMS, width), the sums of a group in a strip times its wave.
-        scratch: float64 (N_ROWS64, width): sums in the making, coefficients of a cubic, lanes.
+        blended: float32 (2, width), a blended table.
+        samples: float32 (width,), those of a strip.
+        wave: float32 (2, CHUNK).
+        total: float64 (N_SUMS, width), sums in the making.
+        cubic: float64 (2, N_COEFFICIENTS).
+        lanes: float64 (4, CHUNK).
         chirps: float32 (N_CHIRPS, 2, STRIP + CHUNK).
-        keys: float64 (N_KEYS,), what chirps, sums and samples there are.
+        chirp_keys: float64 (N_CHIRPS + 1,), see :func:`find_chirp`.
+        sum_keys: int64 (N_TABLES + 1, 3), axis, first tone, latest segment; and the next place.
+        strip: int64 (3,), axis, segment and strip of the samples.
         nodes: int32 (3, width / LANES), of a tone.
         repeated: int16 (width,), a block that is repeated.
     """
 
     sums: Singles
-    work: Singles
     table: Singles
-    scratch: Floats
+    blended: Singles
+    samples: Singles
+    wave: Singles
+    total: Floats
+    cubic: Floats
+    lanes: Floats
     chirps: Singles
-    keys: Floats
+    chirp_keys: Floats
+    sum_keys: Words
+    strip: Words
     nodes: Ints
     repeated: NDArray[np.int16]
 
@@ -304,13 +300,19 @@ def space_of(words: Words) -> Space:
     width, at = words[WIDTH], words[SPACE_AT:]
     return Space(
         carray(pointer(at[0]), (N_TABLES, N_SUMS, width), np.float32),
-        carray(pointer(at[1]), (N_ROWS32, width), np.float32),
-        carray(pointer(at[2]), (N_SUMS, width), np.float32),
-        carray(pointer(at[3]), (N_ROWS64, width), np.float64),
-        carray(pointer(at[4]), (N_CHIRPS, 2, STRIP + CHUNK), np.float32),
-        carray(pointer(at[5]), N_KEYS, np.float64),
-        carray(pointer(at[6]), (3, width // LANES), np.int32),
-        carray(pointer(at[7]), width, np.int16),
+        carray(pointer(at[1]), (N_SUMS, width), np.float32),
+        carray(pointer(at[2]), (2, width), np.float32),
+        carray(pointer(at[3]), width, np.float32),
+        carray(pointer(at[4]), (2, CHUNK), np.float32),
+        carray(pointer(at[5]), (N_SUMS, width), np.float64),
+        carray(pointer(at[6]), (2, N_COEFFICIENTS), np.float64),
+        carray(pointer(at[7]), (4, CHUNK), np.float64),
+        carray(pointer(at[8]), (N_CHIRPS, 2, STRIP + CHUNK), np.float32),
+        carray(pointer(at[9]), N_CHIRPS + 1, np.float64),
+        carray(pointer(at[10]), (N_TABLES + 1, 3), np.int64),
+        carray(pointer(at[11]), 3, np.int64),
+        carray(pointer(at[12]), (3, width // LANES), np.int32),
+        carray(pointer(at[13]), width, np.int16),
     )
 
 
@@ -329,16 +331,21 @@ class Workspace:
         """
         width = 2 * max(block, STRIP) + 4 * CHUNK
         self._space = Space(
-            _aligned((N_TABLES, N_SUMS, width), np.float32),
-            _aligned((N_ROWS32, width), np.float32),
-            _aligned((N_SUMS, width), np.float32),
-            _aligned((N_ROWS64, width), np.float64),
-            _aligned((N_CHIRPS, 2, STRIP + CHUNK), np.float32),
-            np.full(N_KEYS, -1.0),
-            np.zeros((3, width // LANES), np.int32),
-            np.zeros(width, np.int16),
+            sums=_aligned((N_TABLES, N_SUMS, width), np.float32),
+            table=_aligned((N_SUMS, width), np.float32),
+            blended=_aligned((2, width), np.float32),
+            samples=_aligned((width,), np.float32),
+            wave=_aligned((2, CHUNK), np.float32),
+            total=_aligned((N_SUMS, width), np.float64),
+            cubic=_aligned((2, N_COEFFICIENTS), np.float64),
+            lanes=_aligned((4, CHUNK), np.float64),
+            chirps=_aligned((N_CHIRPS, 2, STRIP + CHUNK), np.float32),
+            chirp_keys=np.append(np.full(N_CHIRPS, np.nan), 0.0),
+            sum_keys=np.append(np.full((N_TABLES, 3), -1, np.int64), np.zeros((1, 3), np.int64), axis=0),
+            strip=np.full(3, -1, np.int64),
+            nodes=np.zeros((3, width // LANES), np.int32),
+            repeated=np.zeros(width, np.int16),
         )
-        self._space.keys[[CHIRP_KEYS - 1, TABLE_KEYS - 1]] = 0.0
         self.words = np.array([width, *(array.ctypes.data for array in self._space)], np.int64)
 
 
@@ -350,12 +357,12 @@ def _aligned(shape: tuple[int, ...], dtype: type[np.floating]) -> NDArray[Any]:
     return memory[first : first + size].view(dtype).reshape(shape)
 
 
-@helper_kernel(f"boolean({F64}, int64, int64, int64, int64)")
-def is_there(keys: Floats, at: int, number: int, i: int, strip: int) -> bool:
-    """Whether tables or samples are those of a strip of segment ``i``; from now on they are."""
-    if keys[at] == number and keys[at + 1] == i and keys[at + 2] == strip:
+@helper_kernel(f"boolean({WORDS}, int64, int64, int64)")
+def is_there(key: Words, number: int, i: int, strip: int) -> bool:
+    """Whether samples are those of a strip of segment ``i`` of an axis; from now on they are."""
+    if key[0] == number and key[1] == i and key[2] == strip:
         return True
-    keys[at], keys[at + 1], keys[at + 2] = number, i, strip
+    key[0], key[1], key[2] = number, i, strip
     return False
 
 

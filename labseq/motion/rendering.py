@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from labseq.motion.render_kernels import Axis, Workspace
 
 
-BLOCK: Final = 1536
+MIN_BLOCK: Final = 1536
 """Smallest size of a block, in samples: in four periods of 390 tones half-way between sites repeat, too."""
 
 TEETH: Final = 8
@@ -139,7 +139,7 @@ def find_comb(spacing: float, lowest_hz: float, span_hz: float, sample_rate_hz: 
     first = math.floor(origin / step) // TEETH * TEETH
     n_teeth = math.ceil((math.floor((origin + span) / step) + 2 - first) / TEETH) * TEETH
     teeth = _teeth(periods * ratio.numerator, period, first, n_teeth)
-    return Comb(first, step, teeth, period * math.ceil(BLOCK / period))
+    return Comb(first, step, teeth, period * math.ceil(MIN_BLOCK / period))
 
 
 @lru_cache(maxsize=64)
@@ -252,8 +252,8 @@ class Renderer:
         for array in (self.first_sample, delta, length):
             array.flags.writeable = False
         axes = [_prepare(program, channel, times, self.sample_rate_hz) for channel in range(N_CHANNELS)]
-        self._axes = axes
-        self.path = np.stack([axis.arrays.path for axis in axes])
+        self._words, self._arrays = zip(*axes, strict=True)
+        self.path = np.stack([arrays.path for arrays in self._arrays])
         self.path.flags.writeable = False
 
     def write(self, channel: int, start: int, out: NDArray[np.int16]) -> None:
@@ -268,15 +268,15 @@ class Renderer:
             out: Result, int16 (n,), contiguous.
         """
         from labseq.motion.render_direct_kernels import render_at
-        from labseq.motion.render_kernels import N_OUT, Workspace
+        from labseq.motion.render_kernels import BLOCK, N_OUT, Workspace
 
-        axis = self._axes[channel]
-        free = _free_workspaces(axis.block)
+        block = int(self._words[channel][BLOCK])
+        free = _free_workspaces(block)
         try:
             workspace = free.pop()
         except IndexError:
-            workspace = Workspace(axis.block)
-        words = np.concatenate([axis.words, workspace.words])
+            workspace = Workspace(block)
+        words = np.concatenate([self._words[channel], workspace.words])
         words[N_OUT] = len(out)
         render_at(words.ctypes.data, start, out.ctypes.data)
         free.append(workspace)
@@ -288,14 +288,15 @@ class Renderer:
             workspaces: Those of the thread that renders, by channel and size of block; the kernel uses them,
                 and what is missing is added. They and the renderer must live as long as the kernel renders.
         """
-        from labseq.motion.render_kernels import N_WORDS, Workspace
+        from labseq.motion.render_kernels import BLOCK, Workspace
 
-        words = np.zeros((N_CHANNELS, N_WORDS), np.int64)
-        for channel, axis in enumerate(self._axes):
-            if (channel, axis.block) not in workspaces:
-                workspaces[channel, axis.block] = Workspace(axis.block)
-            words[channel] = np.concatenate([axis.words, workspaces[channel, axis.block].words])
-        return words
+        rows: list[NDArray[np.int64]] = []
+        for channel, words in enumerate(self._words):
+            key = channel, int(words[BLOCK])
+            if key not in workspaces:
+                workspaces[key] = Workspace(key[1])
+            rows.append(np.concatenate([words, workspaces[key].words]))
+        return np.array(rows)
 
 
 def render_address() -> int:
@@ -370,28 +371,16 @@ def _write_channels(renderer: Renderer, start: int, out: NDArray[np.int16]) -> N
         renderer.write(channel, start, out[channel])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Axis:
-    """An axis as kernels see it.
-
-    Attributes:
-        block: Samples of a block.
-        words: int64 (WIDTH,), see :data:`labseq.motion.render_kernels.N_WORDS`.
-        arrays: What is at the addresses in it.
-    """
-
-    block: int
-    words: NDArray[np.int64]
-    arrays: Axis
-
-
 def _prepare(
     program: ToneProgram,
     channel: int,
     times: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]],
     sample_rate_hz: float,
-) -> _Axis:
+) -> tuple[NDArray[np.int64], Axis]:
     """Convert an axis to the kernels' units, and choose how each segment is rendered.
+
+    Returns:
+        int64 (WIDTH,), see :data:`labseq.motion.render_kernels.N_WORDS`, and what is at the addresses in it.
 
     Raises:
         LimitError: See :class:`Renderer`.
@@ -427,7 +416,7 @@ def _prepare(
     bits, addresses = np.float64(comb.step).view(np.int64), (array.ctypes.data for array in arrays)
     words = np.array([*numbers, bits, comb.block, next(_NUMBERS), *addresses], np.int64)
     choose_paths(words)
-    return _Axis(comb.block, words, arrays)
+    return words, arrays
 
 
 def _refuse_durations(program: ToneProgram, sample_rate_hz: float) -> NoReturn:

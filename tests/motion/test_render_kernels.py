@@ -69,7 +69,7 @@ def test_a_chirp_is_filled_in_right(chirp: float) -> None:
 def test_a_chirp_that_was_filled_in_is_found_again() -> None:
     n, room = render_kernels.N_CHIRPS, render_kernels.STRIP + render_kernels.LANES
     chirps = np.zeros((n, 2, room), np.float32)
-    keys = np.concatenate([[0.0], np.full(n, np.nan)])
+    keys = np.append(np.full(n, np.nan), 0.0)
     lanes = np.zeros((4, render_kernels.LANES))
     found = [render_kernels.find_chirp(chirp * 1e-8, chirps, keys, lanes) for chirp in (1, 2, 1, 3, 2)]
     assert found == [0, 1, 0, 2, 1]
