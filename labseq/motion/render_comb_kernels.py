@@ -29,7 +29,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.kernels.kernel import helper_kernel
+from labseq.kernels.kernel import const, helper_kernel
 from labseq.motion.render_group_kernels import envelope, fit_cubic, next_of_group, off_tooth, segment_of
 from labseq.motion.render_kernels import (
     BLENDED,
@@ -38,11 +38,14 @@ from labseq.motion.render_kernels import (
     CHUNK,
     END_AMPLITUDE,
     F32,
+    F64,
     FIRST_TOOTH,
     FREQUENCY,
     FULL_SCALE,
+    LANES,
+    N_CHIRPS,
     N_COEFFICIENTS,
-    N_TABLES,
+    N_KEPT,
     NUMBER,
     ON_TOOTH,
     PERIOD,
@@ -56,16 +59,12 @@ from labseq.motion.render_kernels import (
     WORDS,
     Complex,
     Words,
-    add_tooth,
     apply_envelope,
     axis_of,
-    fill_powers,
-    find_chirp,
     is_there,
     repeat,
     space_of,
     store,
-    times,
     turn,
 )
 
@@ -74,6 +73,104 @@ Singles = NDArray[np.float32]
 
 
 COMPLEX: Final = "UniTuple(float64, 2)"
+
+CHIRP_GRID: Final = 2.0**62
+
+
+@helper_kernel("UniTuple(float64, 2)(float64, float64, float64, float64)", fused=True)
+def times(a_re: float, a_im: float, b_re: float, b_im: float) -> Complex:
+    """Product of two complex numbers."""
+    return a_re * b_re - a_im * b_im, a_re * b_im + a_im * b_re
+
+
+@helper_kernel(f"UniTuple(float64, 2)(float64, {F64}, {F64})", fused=True)
+def fill_powers(cycles: float, re: Floats, im: Floats) -> Complex:
+    """Fill in exp(2 pi i cycles r), r = 0 ... n - 1, where n is a power of 2; return the next one."""
+    x, y = turn(cycles)
+    re[0], im[0] = 1.0, 0.0
+    done = 1
+    while done < len(re):
+        from_re, from_im, to_re, to_im = re[:done], im[:done], re[done:], im[done:]
+        for r in range(done):
+            to_re[r] = from_re[r] * x - from_im[r] * y
+        for r in range(done):
+            to_im[r] = from_re[r] * y + from_im[r] * x
+        x, y = times(x, y, x, y)
+        done *= 2
+    return x, y
+
+
+@helper_kernel(f"void({F64}, {F64}, {F64}, {F64}, int64)", fused=True)
+def multiply(re: Floats, im: Floats, by_re: Floats, by_im: Floats, n: int) -> None:
+    """Multiply the first ``n`` complex numbers by others in place."""
+    for r in range(n):
+        x, y = re[r], im[r]
+        re[r] = x * by_re[r] - y * by_im[r]
+        im[r] = x * by_im[r] + y * by_re[r]
+
+
+@helper_kernel(
+    f"void({const('float64', 1)}, {const('float64', 1)}, float64, float64, {F64}, {F64})", fused=True
+)
+def add_tooth(
+    cosine: Floats, sine: Floats, weight_re: float, weight_im: float, re: Floats, im: Floats
+) -> None:
+    """Add a tone, the wave of its tooth times a complex weight, to the sum over a period, float64 (>= n,)."""
+    for j in range(len(cosine)):
+        re[j] += weight_re * cosine[j] - weight_im * sine[j]
+        im[j] += weight_re * sine[j] + weight_im * cosine[j]
+
+
+@helper_kernel(f"void(float64, int64, {F32}, {F32}, float64[:, ::1])", fused=True)
+def fill_chirp(chirp: float, n: int, re: Singles, im: Singles, lanes: Floats) -> None:
+    """Fill in exp(pi i chirp j^2), j = 0 ... n - 1.
+
+    ``re`` and ``im`` are float32 (>= n + LANES,), ``lanes`` is scratch, float64 (4, >= LANES).
+    """
+    now_re, now_im, by_re, by_im = lanes[0, :LANES], lanes[1, :LANES], lanes[2, :LANES], lanes[3, :LANES]
+    step_re, step_im = turn(0.5 * chirp)
+    more_re, more_im = turn(chirp)
+    x, y = 1.0, 0.0
+    for r in range(LANES):
+        now_re[r], now_im[r] = x, y
+        x, y = times(x, y, step_re, step_im)
+        step_re, step_im = times(step_re, step_im, more_re, more_im)
+    fill_powers(chirp * LANES, by_re, by_im)
+    a, b, step_re, step_im = 1.0, 0.0, *turn(0.5 * chirp * LANES * LANES)
+    more_re, more_im = turn(chirp * LANES * LANES)
+    for q in range((n + LANES - 1) // LANES):
+        out_re, out_im = re[q * LANES :], im[q * LANES :]
+        for r in range(LANES):
+            out_re[r] = np.float32(a * now_re[r] - b * now_im[r])
+        for r in range(LANES):
+            out_im[r] = np.float32(a * now_im[r] + b * now_re[r])
+        a, b = times(a, b, step_re, step_im)
+        step_re, step_im = times(step_re, step_im, more_re, more_im)
+        multiply(now_re, now_im, by_re, by_im, LANES)
+
+
+@helper_kernel(f"int64(float64, float32[:, :, ::1], {F64}, float64[:, ::1])")
+def find_chirp(chirp: float, chirps: Singles, keys: Floats, lanes: Floats) -> int:
+    """Find or fill in exp(pi i chirp j^2) for a strip, which many segments share.
+
+    Args:
+        chirp: In cycles per sample squared; rounded to a grid that makes no difference in a strip.
+        chirps: float32 (N_CHIRPS, 2, >= STRIP + LANES), those that there are; updated.
+        keys: float64 (N_CHIRPS + 1,), each of them, and how many were filled in; updated.
+        lanes: Scratch, see :func:`fill_chirp`.
+
+    Returns:
+        Its index in ``chirps``.
+    """
+    chirp = np.rint(chirp * CHIRP_GRID) / CHIRP_GRID
+    for at in range(N_CHIRPS):
+        if keys[at] == chirp:
+            return at
+    at = int(keys[N_CHIRPS]) % N_CHIRPS
+    fill_chirp(chirp, STRIP, chirps[at, 0], chirps[at, 1], lanes)
+    keys[at] = chirp
+    keys[N_CHIRPS] += 1.0
+    return at
 
 
 @helper_kernel(f"void({F32}, int64, {F32}, {F32}, int64, int64, {COMPLEX}, {COMPLEX})", fused=True)
@@ -149,7 +246,7 @@ def blend(
     """Blend tables by a cubic in the time since the start of the segment, for ``n`` samples of a strip.
 
     Args:
-        tables: float32 (N_SUMS, ...), real and imaginary part of the coefficient of each power.
+        tables: float32 (N_ROWS, ...), real and imaginary part of the coefficient of each power.
         n: How many samples, rounded up to whole chunks.
         period: Period of the tables.
         by: By which they are multiplied from period to period.
@@ -195,20 +292,18 @@ def add_to_sums(words: Words, i: int, k: int, anchor: int, shared: bool, n_sums:
         drift, bend = off_tooth(tones, k, anchor, tooth - axis.tooth[anchor], step, axis.length[i])
         fit_cubic(a, b, drift, bend, re, im)
     x, y = turn(tones[PHASE, k] + step * tooth * axis.delta[i])
-    cosine, sine = (
-        axis.teeth[2 * (tooth - words[FIRST_TOOTH])],
-        axis.teeth[2 * (tooth - words[FIRST_TOOTH]) + 1],
-    )
+    row = 2 * (tooth - words[FIRST_TOOTH])
     for power in range(n_sums):
         w_re = FULL_SCALE * (x * re[power] - y * im[power])
         w_im = FULL_SCALE * (x * im[power] + y * re[power])
-        add_tooth(cosine, sine, w_re, w_im, space.total[2 * power], space.total[2 * power + 1])
+        re_sum, im_sum = space.total[2 * power], space.total[2 * power + 1]
+        add_tooth(axis.teeth[row], axis.teeth[row + 1], w_re, w_im, re_sum, im_sum)
 
 
 @helper_kernel("int64(int64[:, ::1], int64, int64)")
 def find_sums(keys: Words, number: int, anchor: int) -> int:
     """Where the sums of a group are in the workspace, by its first tone; -1 if they are not there."""
-    for at in range(N_TABLES):
+    for at in range(N_KEPT):
         if keys[at, 0] == number and keys[at, 1] == anchor:
             return at
     return -1
@@ -218,7 +313,7 @@ def find_sums(keys: Words, number: int, anchor: int) -> int:
 def find_all_sums(words: Words, i: int) -> None:
     """Fill in the sums of the groups of segment ``i`` that are not in the workspace."""
     axis, keys, number = axis_of(words), space_of(words).sum_keys, words[NUMBER]
-    table = axis.table[axis.offsets[i] : axis.offsets[i + 1]]
+    table = axis.origin[axis.offsets[i] : axis.offsets[i + 1]]
     for anchor in table:
         at = find_sums(keys, number, anchor) if anchor >= 0 else -1
         if at >= 0:
@@ -226,11 +321,11 @@ def find_all_sums(words: Words, i: int) -> None:
     for anchor in table:
         if anchor < 0 or find_sums(keys, number, anchor) >= 0:
             continue
-        at = keys[N_TABLES, 0]
+        at = keys[N_KEPT, 0]
         while keys[at, 0] == number and keys[at, 2] == i:  # the segment needs it, too
-            at = (at + 1) % N_TABLES
+            at = (at + 1) % N_KEPT
         keys[at, 0], keys[at, 1], keys[at, 2] = number, anchor, i
-        keys[N_TABLES, 0] = (at + 1) % N_TABLES
+        keys[N_KEPT, 0] = (at + 1) % N_KEPT
         fill_sums(words, anchor, at)
 
 
@@ -356,12 +451,12 @@ def fill_strip(words: Words, i: int, start: int, n: int) -> None:
         if steady == 1.0 and slope != 0.0:
             apply_envelope(acc, n, axis.squares[0, i] + slope * x, slope)
         for k in range(axis.offsets[i], axis.offsets[i + 1]):
-            if axis.table[k] < 0 or waves[STEADY, k] != steady:
+            if axis.origin[k] < 0 or waves[STEADY, k] != steady:
                 continue
             frequency, chirp = waves[FREQUENCY, k], waves[CHIRP, k]
             phase = waves[PHASE_SINCE, k] + x * (frequency + 0.5 * chirp * x)
             offset = (int(waves[SINCE, k]) + start) % words[PERIOD]
-            at = find_sums(space.sum_keys, words[NUMBER], axis.table[k])
+            at = find_sums(space.sum_keys, words[NUMBER], axis.origin[k])
             add_group(words, n, at, offset, phase, frequency + chirp * x, chirp, x * per_sample, per_sample)
 
 
@@ -372,7 +467,7 @@ def has_period(words: Words, i: int) -> bool:
     waves = axis.waves
     for k in range(axis.offsets[i], axis.offsets[i + 1]):
         cycles = waves[FREQUENCY, k] * block
-        if axis.table[k] >= 0 and not (
+        if axis.origin[k] >= 0 and not (
             waves[STEADY, k] == 1.0
             and waves[CHIRP, k] == 0.0
             and abs(cycles - np.rint(cycles)) * axis.length[i] <= ON_TOOTH * block

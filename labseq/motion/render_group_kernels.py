@@ -264,7 +264,7 @@ def has_same_sums(words: Words, i: int, k: int, m: int) -> bool:
 def fill_wave(words: Words, i: int, k: int) -> None:
     """Fill in what multiplies the sums of the group whose first tone is ``k``, and take over their teeth."""
     axis = axis_of(words)
-    m = axis.table[k]
+    m = axis.origin[k]
     tones, tooth, waves, (since, per_tooth) = axis.tones, axis.tooth, axis.waves, since_tone(words, i, m)
     waves[PHASE_SINCE, k] = tones[PHASE, k] - tones[PHASE, m] - tooth[m] * per_tooth
     waves[FREQUENCY, k] = tones[START, k] - words.view(np.float64)[STEP] * tooth[m]
@@ -277,7 +277,7 @@ def fill_wave(words: Words, i: int, k: int) -> None:
 
 
 @helper_kernel(f"void({WORDS}, int64, int64[::1])")
-def find_tables(words: Words, i: int, latest: NDArray[np.int64]) -> None:
+def find_origins(words: Words, i: int, latest: NDArray[np.int64]) -> None:
     """Find the groups of segment ``i`` that stay together from the one before on; they keep its sums.
 
     ``latest``, int64 (MAX_GROUPS,), is the first tone of each group of the segment before in the segment
@@ -287,14 +287,14 @@ def find_tables(words: Words, i: int, latest: NDArray[np.int64]) -> None:
     latest[:] = -1
     for k in range(axis.offsets[i], axis.offsets[i + 1]):
         g = axis.group[k]
-        axis.table[k] = -1
+        axis.origin[k] = -1
         if latest[g] >= 0:
             continue
         latest[g] = k
         for m in before:
             if m >= 0 and latest[g] == k and has_same_sums(words, i, k, m):
                 latest[g] = m
-        axis.table[k] = latest[g]
+        axis.origin[k] = latest[g]
         fill_wave(words, i, k)
 
 
@@ -307,4 +307,4 @@ def choose_paths(words: Words) -> None:
         shared, axis.squares[0, i], axis.squares[1, i] = envelope(axis.tones, start, stop)
         axis.path[i] = choose(words, i, shared)
         if axis.path[i] == COMB or axis.path[i] == BLENDED:
-            find_tables(words, i, latest)
+            find_origins(words, i, latest)

@@ -1,4 +1,4 @@
-"""Kernels that all renderers share: axes and workspaces, waves and chirps, envelopes, rounding and storing.
+"""What the kernels of rendering share: the arrays of axes and workspaces, envelopes, rounding and storing.
 
 The tones of an axis are rows of a float64 array, as in :mod:`labseq.motion.tone_kernels`:
 frequency at the start and at the end of the segment, amplitude at the start and at the
@@ -34,10 +34,8 @@ STRIP: Final = 8192
 N_CHIRPS: Final = 32
 """Number of cached chirps: lanes that weave need up to 20 on an axis."""
 
-N_TABLES: Final = 8
-"""Number of cached sums: twice the groups of a segment."""
-
-CHIRP_GRID: Final = 2.0**62
+N_KEPT: Final = 8
+"""Number of sums kept in a workspace: twice the groups of a segment."""
 
 F32: Final = "float32[::1]"
 F64: Final = "float64[::1]"
@@ -48,102 +46,6 @@ def turn(cycles: float) -> Complex:
     """Cosine and sine of a phase in cycles."""
     phase = 2.0 * math.pi * (cycles - np.rint(cycles))
     return math.cos(phase), math.sin(phase)
-
-
-@helper_kernel("UniTuple(float64, 2)(float64, float64, float64, float64)", fused=True)
-def times(a_re: float, a_im: float, b_re: float, b_im: float) -> Complex:
-    """Product of two complex numbers."""
-    return a_re * b_re - a_im * b_im, a_re * b_im + a_im * b_re
-
-
-@helper_kernel(f"UniTuple(float64, 2)(float64, {F64}, {F64})", fused=True)
-def fill_powers(cycles: float, re: Floats, im: Floats) -> Complex:
-    """Fill in exp(2 pi i cycles r), r = 0 ... n - 1, where n is a power of 2; return the next one."""
-    x, y = turn(cycles)
-    re[0], im[0] = 1.0, 0.0
-    done = 1
-    while done < len(re):
-        from_re, from_im, to_re, to_im = re[:done], im[:done], re[done:], im[done:]
-        for r in range(done):
-            to_re[r] = from_re[r] * x - from_im[r] * y
-        for r in range(done):
-            to_im[r] = from_re[r] * y + from_im[r] * x
-        x, y = times(x, y, x, y)
-        done *= 2
-    return x, y
-
-
-@kernel(f"void({F64}, {F64}, {F64}, {F64}, int64)", fused=True)
-def multiply(re: Floats, im: Floats, by_re: Floats, by_im: Floats, n: int) -> None:
-    """Multiply the first ``n`` complex numbers by others in place."""
-    for r in range(n):
-        x, y = re[r], im[r]
-        re[r] = x * by_re[r] - y * by_im[r]
-        im[r] = x * by_im[r] + y * by_re[r]
-
-
-@helper_kernel(
-    f"void({const('float64', 1)}, {const('float64', 1)}, float64, float64, {F64}, {F64})", fused=True
-)
-def add_tooth(
-    cosine: Floats, sine: Floats, weight_re: float, weight_im: float, re: Floats, im: Floats
-) -> None:
-    """Add a tone, the wave of its tooth times a complex weight, to the sum over a period, float64 (>= n,)."""
-    for j in range(len(cosine)):
-        re[j] += weight_re * cosine[j] - weight_im * sine[j]
-        im[j] += weight_re * sine[j] + weight_im * cosine[j]
-
-
-@helper_kernel(f"void(float64, int64, {F32}, {F32}, float64[:, ::1])", fused=True)
-def fill_chirp(chirp: float, n: int, re: Singles, im: Singles, lanes: Floats) -> None:
-    """Fill in exp(pi i chirp j^2), j = 0 ... n - 1.
-
-    ``re`` and ``im`` are float32 (>= n + LANES,), ``lanes`` is scratch, float64 (4, >= LANES).
-    """
-    now_re, now_im, by_re, by_im = lanes[0, :LANES], lanes[1, :LANES], lanes[2, :LANES], lanes[3, :LANES]
-    step_re, step_im = turn(0.5 * chirp)
-    more_re, more_im = turn(chirp)
-    x, y = 1.0, 0.0
-    for r in range(LANES):
-        now_re[r], now_im[r] = x, y
-        x, y = times(x, y, step_re, step_im)
-        step_re, step_im = times(step_re, step_im, more_re, more_im)
-    fill_powers(chirp * LANES, by_re, by_im)
-    a, b, step_re, step_im = 1.0, 0.0, *turn(0.5 * chirp * LANES * LANES)
-    more_re, more_im = turn(chirp * LANES * LANES)
-    for q in range((n + LANES - 1) // LANES):
-        out_re, out_im = re[q * LANES :], im[q * LANES :]
-        for r in range(LANES):
-            out_re[r] = np.float32(a * now_re[r] - b * now_im[r])
-        for r in range(LANES):
-            out_im[r] = np.float32(a * now_im[r] + b * now_re[r])
-        a, b = times(a, b, step_re, step_im)
-        step_re, step_im = times(step_re, step_im, more_re, more_im)
-        multiply(now_re, now_im, by_re, by_im, LANES)
-
-
-@helper_kernel(f"int64(float64, float32[:, :, ::1], {F64}, float64[:, ::1])")
-def find_chirp(chirp: float, chirps: Singles, keys: Floats, lanes: Floats) -> int:
-    """Find or fill in exp(pi i chirp j^2) for a strip, which many segments share.
-
-    Args:
-        chirp: In cycles per sample squared; rounded to a grid that makes no difference in a strip.
-        chirps: float32 (N_CHIRPS, 2, >= STRIP + LANES), those that there are; updated.
-        keys: float64 (N_CHIRPS + 1,), each of them, and how many were filled in; updated.
-        lanes: Scratch, see :func:`fill_chirp`.
-
-    Returns:
-        Its index in ``chirps``.
-    """
-    chirp = np.rint(chirp * CHIRP_GRID) / CHIRP_GRID
-    for at in range(N_CHIRPS):
-        if keys[at] == chirp:
-            return at
-    at = int(keys[N_CHIRPS]) % N_CHIRPS
-    fill_chirp(chirp, STRIP, chirps[at, 0], chirps[at, 1], lanes)
-    keys[at] = chirp
-    keys[N_CHIRPS] += 1.0
-    return at
 
 
 START: Final = 0
@@ -180,10 +82,11 @@ Samples = NDArray[np.int16]
 
 FULL_SCALE: Final = 32767.0
 
-N_SUMS: Final = 2 * N_COEFFICIENTS
+N_ROWS: Final = 2 * N_COEFFICIENTS
 """Rows of a table: real and imaginary part of the coefficient of each power of the time."""
 
-N_OUT: Final = 0  # of the words of an axis: how many samples to render
+# Kernels get words, int64: to pass twenty arrays to each takes as long as to render 1000 samples.
+N_OUT: Final = 0  # how many samples to render
 N_TONES: Final = 1
 N_SEGMENTS: Final = 2
 PERIOD: Final = 3  # of the teeth
@@ -193,11 +96,6 @@ STEP: Final = 6  # spacing of the teeth in cycles per sample, a float64
 BLOCK: Final = 7  # samples of a block
 NUMBER: Final = 8  # that no other axis has
 AXIS_AT: Final = 9  # addresses of the arrays of an Axis
-WIDTH: Final = 22  # of the workspace in which it is rendered
-SPACE_AT: Final = 23  # addresses of the arrays of its Space
-N_WORDS: Final = 37
-"""Words, int64, that kernels get: to pass twenty arrays to each takes as long as to render 1000 samples."""
-
 Words = NDArray[np.int64]
 WORDS: Final = "int64[::1]"
 
@@ -216,10 +114,10 @@ class Axis(NamedTuple):
         path: int8 (n_segments,), see :class:`labseq.motion.RenderPath`.
         squares: float64 (2, n_segments), squared amplitude of tones that are not steady at its start and end.
         group: int8 (n_tones,), the group of each tone in its segment.
-        tooth: int32 (n_tones,), its tooth, as in the segment of its table.
-        table: int32 (n_tones,), for the first tone of a group that of the first segment that has the same
-            sums, else -1.
-        waves: float64 (N_WAVE, n_tones), for the first one what multiplies the sums.
+        origin: int32 (n_tones,), for the first tone of a group the one of the first group of the same sums,
+            else -1.
+        waves: float64 (N_WAVE, n_tones), for the first tone of a group what multiplies these sums.
+        tooth: int32 (n_tones,), tooth of each tone, as in the group of its origin.
     """
 
     tones: Floats
@@ -232,9 +130,13 @@ class Axis(NamedTuple):
     path: Bytes
     squares: Floats
     group: Bytes
-    tooth: Ints
-    table: Ints
+    origin: Ints
     waves: Floats
+    tooth: Ints
+
+
+WIDTH: Final = AXIS_AT + len(Axis._fields)  # of the workspace in which the axis is rendered
+SPACE_AT: Final = WIDTH + 1  # addresses of the arrays of its Space
 
 
 @helper_kernel()
@@ -253,8 +155,8 @@ def axis_of(words: Words) -> Axis:
         carray(pointer(at[8]), (2, n), np.float64),
         carray(pointer(at[9]), n_tones, np.int8),
         carray(pointer(at[10]), n_tones, np.int32),
-        carray(pointer(at[11]), n_tones, np.int32),
-        carray(pointer(at[12]), (N_WAVE, n_tones), np.float64),
+        carray(pointer(at[11]), (N_WAVE, n_tones), np.float64),
+        carray(pointer(at[12]), n_tones, np.int32),
     )
 
 
@@ -262,17 +164,17 @@ class Space(NamedTuple):
     """The arrays of a workspace.
 
     Attributes:
-        sums: float32 (N_TABLES, N_SUMS, width), over two periods, or a period and a strip.
-        table: float32 (N_SUMS, width), the sums of a group in a strip times its wave.
+        sums: float32 (N_KEPT, N_ROWS, width), over two periods, or a period and a strip.
+        table: float32 (N_ROWS, width), the sums of a group in a strip times its wave.
         blended: float32 (2, width), a blended table.
         samples: float32 (width,), those of a strip.
         wave: float32 (2, CHUNK).
-        total: float64 (N_SUMS, width), sums in the making.
+        total: float64 (N_ROWS, width), sums in the making.
         cubic: float64 (2, N_COEFFICIENTS).
         lanes: float64 (4, CHUNK).
         chirps: float32 (N_CHIRPS, 2, STRIP + CHUNK).
         chirp_keys: float64 (N_CHIRPS + 1,), see :func:`find_chirp`.
-        sum_keys: int64 (N_TABLES + 1, 3), axis, first tone, latest segment; and the next place.
+        sum_keys: int64 (N_KEPT + 1, 3), axis, first tone, latest segment; and the next place.
         strip: int64 (3,), axis, segment and strip of the samples.
         nodes: int32 (3, width / LANES), of a tone.
         repeated: int16 (width,), a block that is repeated.
@@ -291,7 +193,10 @@ class Space(NamedTuple):
     sum_keys: Words
     strip: Words
     nodes: Ints
-    repeated: NDArray[np.int16]
+    repeated: Samples
+
+
+N_WORDS: Final = SPACE_AT + len(Space._fields)
 
 
 @helper_kernel()
@@ -299,17 +204,17 @@ def space_of(words: Words) -> Space:
     """The arrays of a workspace."""
     width, at = words[WIDTH], words[SPACE_AT:]
     return Space(
-        carray(pointer(at[0]), (N_TABLES, N_SUMS, width), np.float32),
-        carray(pointer(at[1]), (N_SUMS, width), np.float32),
+        carray(pointer(at[0]), (N_KEPT, N_ROWS, width), np.float32),
+        carray(pointer(at[1]), (N_ROWS, width), np.float32),
         carray(pointer(at[2]), (2, width), np.float32),
         carray(pointer(at[3]), width, np.float32),
         carray(pointer(at[4]), (2, CHUNK), np.float32),
-        carray(pointer(at[5]), (N_SUMS, width), np.float64),
+        carray(pointer(at[5]), (N_ROWS, width), np.float64),
         carray(pointer(at[6]), (2, N_COEFFICIENTS), np.float64),
         carray(pointer(at[7]), (4, CHUNK), np.float64),
         carray(pointer(at[8]), (N_CHIRPS, 2, STRIP + CHUNK), np.float32),
         carray(pointer(at[9]), N_CHIRPS + 1, np.float64),
-        carray(pointer(at[10]), (N_TABLES + 1, 3), np.int64),
+        carray(pointer(at[10]), (N_KEPT + 1, 3), np.int64),
         carray(pointer(at[11]), 3, np.int64),
         carray(pointer(at[12]), (3, width // LANES), np.int32),
         carray(pointer(at[13]), width, np.int16),
@@ -331,17 +236,17 @@ class Workspace:
         """
         width = 2 * max(block, STRIP) + 4 * CHUNK
         self._space = Space(
-            sums=_aligned((N_TABLES, N_SUMS, width), np.float32),
-            table=_aligned((N_SUMS, width), np.float32),
+            sums=_aligned((N_KEPT, N_ROWS, width), np.float32),
+            table=_aligned((N_ROWS, width), np.float32),
             blended=_aligned((2, width), np.float32),
             samples=_aligned((width,), np.float32),
             wave=_aligned((2, CHUNK), np.float32),
-            total=_aligned((N_SUMS, width), np.float64),
+            total=_aligned((N_ROWS, width), np.float64),
             cubic=_aligned((2, N_COEFFICIENTS), np.float64),
             lanes=_aligned((4, CHUNK), np.float64),
             chirps=_aligned((N_CHIRPS, 2, STRIP + CHUNK), np.float32),
             chirp_keys=np.append(np.full(N_CHIRPS, np.nan), 0.0),
-            sum_keys=np.append(np.full((N_TABLES, 3), -1, np.int64), np.zeros((1, 3), np.int64), axis=0),
+            sum_keys=np.append(np.full((N_KEPT, 3), -1, np.int64), np.zeros((1, 3), np.int64), axis=0),
             strip=np.full(3, -1, np.int64),
             nodes=np.zeros((3, width // LANES), np.int32),
             repeated=np.zeros(width, np.int16),

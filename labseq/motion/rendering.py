@@ -1,4 +1,14 @@
-"""Rendering: the samples of a tone program."""
+"""Rendering: the samples of a tone program.
+
+A :class:`Renderer` checks a program, and its kernels do the work:
+
+- ``comb_kernels`` find the spacing of the tones of an axis;
+- ``render_group_kernels`` choose how each segment is rendered, and which of its tones share a chirp;
+- ``render_comb_kernels`` render such groups, ``render_direct_kernels`` anything else, tone by tone;
+- ``render_kernels`` is what these share: the arrays of an axis and of a workspace, envelopes, rounding.
+
+``render_reference`` defines the samples in plain numpy, for tests.
+"""
 
 from __future__ import annotations
 
@@ -182,7 +192,7 @@ MAX_WORKSPACES: Final = 8
 
 def warm_rendering() -> None:
     """Compile the kernels of rendering, or load them from the cache; for drivers that play samples."""
-    for kernels in ("comb_kernels", "render_direct_kernels", "render_group_kernels"):
+    for kernels in ("comb_kernels", "render_direct_kernels"):  # which imports the others
         importlib.import_module(f"labseq.motion.{kernels}")
 
 
@@ -380,7 +390,7 @@ def _prepare(
     """Convert an axis to the kernels' units, and choose how each segment is rendered.
 
     Returns:
-        int64 (WIDTH,), see :data:`labseq.motion.render_kernels.N_WORDS`, and what is at the addresses in it.
+        int64 (WIDTH,), words as in :mod:`labseq.motion.render_kernels`, and what is at the addresses in it.
 
     Raises:
         LimitError: See :class:`Renderer`.
@@ -409,7 +419,7 @@ def _prepare(
         squares=np.empty((2, n_segments)),
         group=np.empty(n_tones, np.int8),
         tooth=np.empty(n_tones, np.int32),
-        table=np.empty(n_tones, np.int32),
+        origin=np.empty(n_tones, np.int32),
         waves=np.empty((N_WAVE, n_tones)),
     )
     numbers = (0, n_tones, n_segments, comb.teeth.shape[1], comb.n_teeth, comb.first)

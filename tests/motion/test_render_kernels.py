@@ -52,7 +52,7 @@ def test_courses_and_their_derivatives_belong_together(kind: FrequencyCourse, u:
 @given(st.floats(-0.5, 0.5), st.sampled_from([1, 2, 32, 128]))
 def test_powers_of_a_wave(cycles: float, n: int) -> None:
     re, im = np.empty((2, n))
-    following = complex(*render_kernels.fill_powers(cycles, re, im))
+    following = complex(*render_comb_kernels.fill_powers(cycles, re, im))
     expected = np.exp(2j * np.pi * cycles * np.arange(n + 1))
     assert np.abs(np.append(re + 1j * im, following) - expected).max() < 1e-12
 
@@ -61,7 +61,7 @@ def test_powers_of_a_wave(cycles: float, n: int) -> None:
 def test_a_chirp_is_filled_in_right(chirp: float) -> None:
     n = 300
     re, im = np.zeros((2, n + 2 * render_kernels.LANES), np.float32)
-    render_kernels.fill_chirp(chirp, n, re, im, np.zeros((4, render_kernels.LANES)))
+    render_comb_kernels.fill_chirp(chirp, n, re, im, np.zeros((4, render_kernels.LANES)))
     expected = np.exp(1j * np.pi * chirp * np.arange(n) ** 2)
     assert np.abs(re[:n] + 1j * im[:n] - expected).max() < 1e-7
 
@@ -71,9 +71,9 @@ def test_a_chirp_that_was_filled_in_is_found_again() -> None:
     chirps = np.zeros((n, 2, room), np.float32)
     keys = np.append(np.full(n, np.nan), 0.0)
     lanes = np.zeros((4, render_kernels.LANES))
-    found = [render_kernels.find_chirp(chirp * 1e-8, chirps, keys, lanes) for chirp in (1, 2, 1, 3, 2)]
+    found = [render_comb_kernels.find_chirp(chirp * 1e-8, chirps, keys, lanes) for chirp in (1, 2, 1, 3, 2)]
     assert found == [0, 1, 0, 2, 1]
-    more = [render_kernels.find_chirp((4 + k) * 1e-8, chirps, keys, lanes) for k in range(n)]
+    more = [render_comb_kernels.find_chirp((4 + k) * 1e-8, chirps, keys, lanes) for k in range(n)]
     assert more == [*range(3, n), 0, 1, 2]
 
 
