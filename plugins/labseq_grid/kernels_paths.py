@@ -35,9 +35,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import helper_kernel
-from labseq_grid.kernels_columns import Ints
+from labseq_grid.kernels_columns import Floats, Ints
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 LANE: Final = 0.5
@@ -106,15 +105,14 @@ def add_knot(knots: Knots, row: Floats, column: Floats) -> Knots:
     """Add a knot, unless all tones are there already."""
     rows, columns, n_knots = knots
     moves = n_knots == 0
+    # loops, here and below: numba compiles them many times faster than assignments of whole arrays
     for i in range(len(row)):
         moves = moves or rows[n_knots - 1, i] != row[i]
+        rows[n_knots, i] = row[i]
     for i in range(len(column)):
         moves = moves or columns[n_knots - 1, i] != column[i]
-    if not moves:
-        return knots
-    rows[n_knots] = row
-    columns[n_knots] = column
-    return rows, columns, n_knots + 1
+        columns[n_knots, i] = column[i]
+    return rows, columns, n_knots + int(moves)
 
 
 @helper_kernel()
@@ -152,9 +150,10 @@ def add_travel(knots: Knots, to: Floats, lanes: Floats, weave: float) -> Knots:
     """
     if weave == 0.0:
         return add_knot(knots, to, lanes)
-    start = knots[0][knots[2] - 1].copy()
-    up = max(0, round((to - start).max()))
-    down = max(0, round((start - to).max()))
+    start, swinging = knots[0][knots[2] - 1].copy(), np.empty(len(lanes))
+    up = down = 0
+    for i in range(len(to)):
+        up, down = max(up, round(to[i] - start[i])), max(down, round(start[i] - to[i]))
     first = 1 if up >= down else -1  # the direction that starts at once
     half, shear = PARTS // 2, 1 if weave > 0.0 else -1
     n_parts = max(PARTS * max(up, down), PARTS * min(up, down) + half if min(up, down) > 0 else 0)
@@ -173,7 +172,9 @@ def add_travel(knots: Knots, to: Floats, lanes: Floats, weave: float) -> Knots:
             else:
                 at[i] = to[i] + swing * shear
         if turns:
-            knots = add_knot(knots, at, lanes + swing)
+            for j in range(len(lanes)):
+                swinging[j] = lanes[j] + swing
+            knots = add_knot(knots, at, swinging)
     return knots
 
 
@@ -260,9 +261,10 @@ def next_to_put_down(carried: Bools, free: Bools, goes_off: Ints, together: Bool
         together: Result, bool (n,), the rows.
         used: Result, bool (m,), the columns that carry atoms in these rows.
     """
-    together[:] = False
-    used[:] = False
+    for j in range(len(used)):
+        used[j] = False
     for i in range(len(together)):
+        together[i] = False
         if goes_off[i] > 0:
             continue
         fits = True
@@ -311,17 +313,18 @@ def find_paths(
     knots = add_travel(knots, there, beside, weave)
     goes_off = np.zeros(n, np.int64)
     together, used = np.ones(n, np.bool_), np.ones(m, np.bool_)
-    first = True
-    while (goes_off == 0).any():
+    at, n_on = np.empty(m), n
+    while n_on > 0:
         if in_stages:
             next_to_put_down(crossings[0], crossings[1], goes_off, together, used)
-        at = np.where(used, columns[1].astype(np.float64), beside)
-        if not first:
+        for j in range(m):
+            at[j] = columns[1][j] if used[j] else beside[j]
+        if n_on < n:
             knots = add_half_site(knots, there, at, weave, band)
-        first = False
         for i in range(n):
             if together[i]:
                 there[i] = rows[1][i]
+                n_on -= 1
         knots = add_half_site(knots, there, at, weave if in_stages else 0.0, band)
         for i in range(n):
             if together[i]:

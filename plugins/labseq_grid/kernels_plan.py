@@ -63,24 +63,30 @@ def paths_of(sites: Sites, machine: Machine, batch: Batch) -> tuple[Floats, Floa
     kind, _, n_beside = sites
     _, slots, may_land, weave, _ = machine
     swapped, rows, columns = batch
-    used = np.zeros(rows.shape[1], np.bool_)  # a row of which no column takes an atom needs no tone
-    for i in range(len(used)):
-        used[i] = (columns[0] >> i & 1).any()
-    bits = np.flatnonzero(used)
-    n, m = len(bits), columns.shape[1]
+    n, m = 0, columns.shape[1]
+    used = np.empty(rows.shape[1], np.int64)
+    for i in range(rows.shape[1]):
+        for j in range(m):
+            if columns[0, j] >> i & 1:  # a row of which no column takes an atom needs no tone
+                used[n] = i
+                n += 1
+                break
     carried, free = np.empty((n, m), np.bool_), np.empty((n, m), np.bool_)
+    row_tones = np.empty(n, np.int64), np.empty(n, np.int64)
+    column_tones = np.empty(m, np.int64), np.empty(m, np.int64)
     for i in range(n):
         for j in range(m):
-            row, col = rows[1, bits[i]], columns[1, j]
+            row, col = rows[1, used[i]], columns[1, j]
             r, c = (col, row) if swapped else (row, col)
-            carried[i, j] = columns[0, j] >> bits[i] & 1
+            carried[i, j] = columns[0, j] >> used[i] & 1
             free[i, j] = carried[i, j] or kind[r, c] == EMPTY
+        row_tones[0][i], row_tones[1][i] = rows[0, used[i]] - n_beside, rows[1, used[i]] - n_beside
+    for j in range(m):
+        column_tones[0][j], column_tones[1][j] = columns[2, j] - n_beside, columns[1, j] - n_beside
     lines, across = (kind.shape[1], kind.shape[0]) if swapped else kind.shape
     last = slots - 2 * n_beside - 1
-    row, to_row = rows[0][used] - n_beside, rows[1][used] - n_beside
-    column, to_column = columns[2] - n_beside, columns[1] - n_beside
-    band = (-slots, lines + last, -slots, across + last)
-    return find_paths((row, to_row), (column, to_column), (carried, free), band, not may_land, weave)
+    band = -slots, lines + last, -slots, across + last
+    return find_paths(row_tones, column_tones, (carried, free), band, not may_land, weave)
 
 
 @helper_kernel()
@@ -88,8 +94,12 @@ def add_axis(paths: Paths, positions: Floats, goes_off: Ints) -> Paths:
     """Add paths of the n tones of an axis, float64 (n_knots, n), and where each goes off, int64 (n,)."""
     shapes, all_positions, off, n_positions, n_off = paths
     stop, off_stop = n_positions + positions.size, n_off + len(goes_off)
-    all_positions[n_positions:stop] = positions.reshape(-1)
-    off[n_off:off_stop] = goes_off
+    n_tones = len(goes_off)
+    for knot in range(len(positions)):
+        for i in range(n_tones):
+            all_positions[n_positions + knot * n_tones + i] = positions[knot, i]
+    for i in range(n_tones):
+        off[n_off + i] = goes_off[i]
     return shapes, all_positions, off, stop, off_stop
 
 
@@ -100,16 +110,21 @@ def add_batch(
     """Add a batch: its atom moves and the paths of its tones."""
     row_path, column_path, goes_off = paths_of(sites, machine, batch)
     n_knots = len(row_path)
-    stays_on = np.full(column_path.shape[1], n_knots - 1)  # the columns are ramped down with the last row
+    stays_on = np.empty(column_path.shape[1], np.int64)
+    for j in range(len(stays_on)):  # the columns are ramped down with the last row
+        stays_on[j] = n_knots - 1
+    shape, n_beside = paths[0][plan[3]], sites[2]
+    shape[0] = n_knots
     if batch[0]:
-        paths[0][plan[3]] = n_knots, column_path.shape[1], row_path.shape[1]
+        shape[1], shape[2] = column_path.shape[1], row_path.shape[1]
         paths = add_axis(add_axis(paths, column_path, stays_on), row_path, goes_off)
     else:
-        paths[0][plan[3]] = n_knots, row_path.shape[1], column_path.shape[1]
+        shape[1], shape[2] = row_path.shape[1], column_path.shape[1]
         paths = add_axis(add_axis(paths, row_path, goes_off), column_path, stays_on)
-    moves = list_moves(batch) - sites[2]
+    moves = list_moves(batch)
     for i in range(len(moves)):
-        plan = add_move(plan, moves[i, 0], moves[i, 1], moves[i, 2], moves[i, 3])
+        row, col, to_row, to_col = moves[i]
+        plan = add_move(plan, row - n_beside, col - n_beside, to_row - n_beside, to_col - n_beside)
     return end_batch(plan, False), paths
 
 
@@ -148,11 +163,12 @@ def state_of(sites: Sites, machine: Machine, fills: bool, band: int) -> State:
     limits, slots, _, _, costs = machine
     spread = 2 * (slots - n_beside) - 1  # a lane needs one line free
     n_rows, n_cols = min(limits[1], kind.shape[0] + spread), min(limits[2], kind.shape[1] + spread)
-    source, unavoidable = kind.copy(), np.zeros(kind.shape)
-    if fills:
-        unavoidable = 2.0 * costs[3] * distances(kind)
-    else:
-        source[:] = np.where(kind == SPARE, STAYS, kind)
+    source, unavoidable = kind.copy(), distances(kind)
+    for row in range(kind.shape[0]):
+        for col in range(kind.shape[1]):
+            unavoidable[row, col] *= 2.0 * costs[3] if fills else 0.0
+            if kind[row, col] == SPARE and not fills:
+                source[row, col] = STAYS
     as_is = view_of(source, vacant.copy(), unavoidable, (limits[0], n_rows, n_cols, band), costs)
     swapped_limits = limits[0], n_cols, n_rows, band
     swapped = view_of(source.T.copy(), vacant.T.copy(), unavoidable.T.copy(), swapped_limits, costs)
