@@ -6,12 +6,7 @@ Importing this package imports no numba: the kernels come with the first call, o
 import importlib
 
 from labseq.model.calibration import correct_overlay
-from labseq.motion.axes import (
-    CombFit,
-    Drive,
-    drive,
-    fit_comb,
-)
+from labseq.motion.axes import CombFit, Drive, drive, fit_comb
 from labseq.motion.check import RULES, check_plan
 from labseq.motion.survival import Survival, choose_plan, pass_hazard, predict_survival
 from labseq.motion.tones import fitting_batches, tone_program

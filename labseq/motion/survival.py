@@ -166,29 +166,17 @@ def choose_plan(
     return min(plans, key=rank)
 
 
+# Fitted to flights of whole plans. From 1.944 um, a straight lane of the paper's lattice, to 2.4 um
+# the barrier of a static tweezer of 300 uK beside one of 2.1 mK rises by 290 to 310 uK per um, and the loss
+# falls by e for each 36 uK. A shallower tweezer lowers the barrier less.
 PASSED_M: Final = 1.944e-6
-"""Distance of a pass that costs ``losses.passing``: that of a straight lane of the paper's lattice."""
-# From 1.944 to 2.4 um the barrier of a static tweezer of 300 uK beside one of 2.1 mK rises by 290 to 310 uK
-# per um, and the loss falls by e for each 36 uK (fitted to flights of whole plans).
 PASS_DECAY_M: Final = 0.12e-6
-"""Additional distance at which a pass costs a factor e less."""
 
 
-def pass_hazard(motion: MotionSpec, distance_m: float) -> float:
-    """Hazard of an atom that a tweezer passes at a distance; that of the tweezer's own atom is the same.
-
-    Args:
-        motion: Its losses, and the depth of tweezers on paths.
-        distance_m: Least distance of the tweezer from the atom, in metres.
-
-    Example:
-        >>> motion = MotionSpec(losses=LossSpec(passing=0.01))
-        >>> round(pass_hazard(motion, PASSED_M + PASS_DECAY_M) / pass_hazard(motion, PASSED_M), 3)
-        0.368
-    """
-    # A shallower tweezer lowers the barrier between the two wells less; the exponent is fitted to flights.
-    at_full_depth = -math.log1p(-motion.losses.passing) * math.exp((PASSED_M - distance_m) / PASS_DECAY_M)
-    return at_full_depth * motion.path_depth**2.2
+def pass_hazard(motion: MotionSpec, distance_m: float = PASSED_M) -> float:
+    """Hazard of an atom, and of the tweezer's own atom, where a tweezer passes at a distance in metres."""
+    hazard = -math.log1p(-motion.losses.passing) * motion.path_depth**2.2
+    return hazard * math.exp((PASSED_M - distance_m) / PASS_DECAY_M)
 
 
 MOVED, LANDED, PASSED = range(3)
@@ -198,7 +186,7 @@ MOVED, LANDED, PASSED = range(3)
 def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, motion: MotionSpec) -> tuple[Floats, int, int]:
     """Hazards of the atom that ends on each site, float64 (3, n_rows, n_cols); landings and passes."""
     losses = motion.losses
-    hazard = pass_hazard(motion, PASSED_M)
+    hazard = pass_hazard(motion)
     hazards = np.zeros((3, *grid.shape))
     if not len(plan.path_shapes):
         from labseq.motion.survival_kernels import line_hazards

@@ -73,7 +73,7 @@ def test_what_does_not_fit_into_the_window_does_not_count() -> None:
     n_tweezers = [int(text.split()[2]) for text in (at_leisure, in_haste)]
     assert n_tweezers[0] < n_tweezers[1]
     loadings = random_loadings(GRID.shape, 0.75, 2)
-    assert planner.plan(loadings[0], COMPACT).n_batches < 13  # as was chosen last
+    assert planner.plan(loadings[0], COMPACT).n_batches < 18  # as was chosen last; with 4 tweezers 20
 
 
 def test_shallow_tweezers_whose_losses_are_not_known_are_left_to_psca() -> None:
