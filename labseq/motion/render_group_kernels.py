@@ -53,6 +53,9 @@ NEAR_TOOTH: Final = 0.05
 BLENDING: Final = 1e-7
 """Allowed error of all cubics together, as a fraction of full scale: 0.003 of the last digit."""
 
+BLENDED_COST: Final = 4
+"""A blended group takes as long to render as so many tones one by one, at a period of 390 samples."""
+
 NODES: Final = 0.5 - 0.5 * np.cos(np.pi * (np.arange(N_COEFFICIENTS) + 0.5) / N_COEFFICIENTS)
 """Points of a segment at which a cubic equals the function that it approximates: Chebyshev nodes."""
 
@@ -134,8 +137,8 @@ def off_tooth(
     return apart * length, 0.5 * sweep * length
 
 
-@helper_kernel(f"boolean({WORDS}, int64, boolean, float64, int64[::1])")
-def find_groups(words: Words, i: int, shared: bool, near: float, anchors: NDArray[np.int64]) -> bool:
+@helper_kernel(f"int64({WORDS}, int64, boolean, float64, int64[::1])")
+def find_groups(words: Words, i: int, shared: bool, near: float, anchors: NDArray[np.int64]) -> int:
     """Give each tone of segment ``i`` its tooth, and a group of tones that share its chirp.
 
     Each group is on a comb of its own: only its spacing is that of the axis. Tones may leave their teeth by
@@ -143,7 +146,7 @@ def find_groups(words: Words, i: int, shared: bool, near: float, anchors: NDArra
     The first tone of each goes into ``anchors``, int64 (MAX_GROUPS,).
 
     Returns:
-        Whether all have one.
+        The number of groups; 0 if a tone has none.
     """
     axis, step = axis_of(words), words.view(np.float64)[STEP]
     tones, tooth, first, n_groups = axis.tones, axis.tooth, words[FIRST_TOOTH], 0
@@ -160,15 +163,15 @@ def find_groups(words: Words, i: int, shared: bool, near: float, anchors: NDArra
                 break
         if its < 0:
             if n_groups == MAX_GROUPS:
-                return False
+                return 0
             anchors[n_groups] = k
             its = n_groups
             tooth[k] = np.int32(math.floor(tones[START, k] / step + 0.25))
             n_groups += 1
         if not first <= tooth[k] < first + words[N_TEETH]:
-            return False
+            return 0
         axis.group[k] = its
-    return True
+    return n_groups
 
 
 @helper_kernel(f"boolean({WORDS}, int64, boolean, int64[::1])")
@@ -199,11 +202,11 @@ def choose(words: Words, i: int, shared: bool) -> int:
         return DIRECT
     anchors = np.zeros(MAX_GROUPS, np.int64)
     for near in (0.5 * ON_TOOTH, NEAR_TOOTH):
-        if not find_groups(words, i, shared, near, anchors):
-            continue
-        if shared and near < ON_TOOTH:
+        n_groups = find_groups(words, i, shared, near, anchors)
+        if n_groups > 0 and shared and near < ON_TOOTH:
             return COMB
-        if can_blend(words, i, shared, anchors):
+        is_worth_it = 0 < BLENDED_COST * n_groups < axis.offsets[i + 1] - axis.offsets[i]
+        if is_worth_it and can_blend(words, i, shared, anchors):
             return BLENDED
     return DIRECT
 

@@ -206,8 +206,8 @@ class RenderPath(IntEnum):
             not grow with their number.
         BLENDED: The same, but amplitudes that change by different factors, or tones a
             little beside their teeth, are followed by a cubic in time: four tables per
-            group are blended. Worth it if all cubics together err by less than 1e-7 of
-            full scale.
+            group are blended. Chosen if all cubics together err by less than 1e-7 of
+            full scale, and groups have more than four tones on average.
         DIRECT: Everything else: each tone by itself.
     """
 
