@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from labseq import watchdog
+from labseq import watchdog_process
 from labseq.watchdog import Watchdog
 
 EMERGENCY = """
@@ -122,11 +122,11 @@ def test_nothing_is_switched_off_without_need(tmp_path):
 
 
 def test_a_device_that_cannot_be_switched_off_does_not_delay_the_others(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(watchdog, "TRY_AGAIN_S", 0.2)
-    monkeypatch.setattr(watchdog, "HANGS_S", 0.1)
+    monkeypatch.setattr(watchdog_process, "TRY_AGAIN_S", 0.2)
+    monkeypatch.setattr(watchdog_process, "HANGS_S", 0.1)
     script = tmp_path / "emergency.py"
     script.write_text(EMERGENCY, encoding="utf-8")
-    process = watchdog._Process()
+    process = watchdog_process._Process()
     process._obey({"run": "the run", "log": str(tmp_path / "watchdog.jsonl"), "path": [], "may_end": False})
     for order, (name, then) in enumerate(
         {"fails": "fails", "hangs": "hangs", "third": "", "lost": "missing"}.items()
@@ -184,8 +184,10 @@ os._exit(0)
     ],
 )
 def test_a_process_that_waits_for_the_computer_does_not_hang(monkeypatch, states, waited_s, silent_s, hangs):
-    is_hanging, all_s = watchdog.Hanging(0), [7.0]
-    monkeypatch.setattr(watchdog, "_threads", lambda _: (states, {"1": 7.0, "2": all_s[0]} if states else {}))
+    is_hanging, all_s = watchdog_process.Hanging(0), [7.0]
+    monkeypatch.setattr(
+        watchdog_process, "_threads", lambda _: (states, {"1": 7.0, "2": all_s[0]} if states else {})
+    )
     assert not is_hanging(0.1)
     all_s[0] += 1.0  # while it worked
     assert not is_hanging(0.2)

@@ -36,7 +36,8 @@ from labseq.roles import Clock, Hardware, RunObserver, Simulation, in_safe_order
 from labseq.safety.locks import device_text, end_holders, lock_devices
 from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.sequencer.lab import attempt, failure_of, open_device
-from labseq.watchdog import TRY_AGAIN_S, Hanging, Watchdog, watchdog_lines
+from labseq.watchdog import Watchdog, watchdog_lines
+from labseq.watchdog_process import TRY_AGAIN_S, Hanging
 
 
 @dataclass(frozen=True, slots=True)
