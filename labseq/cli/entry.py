@@ -106,7 +106,7 @@ def _in_own_words(error: Any) -> Any:
     parameter, errors = getattr(error, "param", None), getattr(error.__cause__, "errors", None)
     if parameter is None or errors is None:
         return error
-    from labseq.config.validation import explain
+    from labseq.config.validation_errors import explain
 
     first = errors(include_url=False)[0]
     value = first["input"]

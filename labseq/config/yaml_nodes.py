@@ -1,7 +1,6 @@
 """Reads YAML text into nodes that carry their line and column.
 
-PyYAML composes its node graph, which is checked while it grows and converted to :class:`Node`. Syntax
-errors are explained at the end of the module.
+PyYAML composes its node graph, which is checked while it grows and converted to :class:`Node`.
 PyYAML's constructor is not used, so no tag can run code. Scalars follow the core rules of YAML 1.2.
 Under YAML 1.1, PyYAML's default, ``off`` would be False, ``10:30`` 630 and ``2026-01-01`` a date. Here
 they are text.
@@ -18,7 +17,7 @@ from typing import Any, Final, NamedTuple, NoReturn, TypeAlias, cast
 
 import yaml
 from yaml.error import Mark as YamlMark, MarkedYAMLError
-from yaml.events import AliasEvent, Event, ScalarEvent
+from yaml.events import AliasEvent, Event
 
 from labseq.errors import ConfigError, Loc, Problem
 from labseq.messages import clean, did_you_mean, shown, visible
@@ -173,6 +172,8 @@ def compose(text: str, source: str, *, is_option: bool = False) -> Node | None:
     except MarkedYAMLError as error:
         # A stray closing bracket makes the level negative.
         opened = composer.marks[-1] if composer.flow_level > 0 else None
+        from labseq.config.syntax_errors import explain_syntax_error  # a right file needs no explanation
+
         found = explain_syntax_error(error, text, composer.last, opened)
         composer.stop(composer.place(found.line, found.column), found.what, found.expected, found.hint)
     except ConfigError:
@@ -321,7 +322,7 @@ class _Composer(yaml.SafeLoader):
         elif node.style == '"' and (escape := _IN_WINDOWS_PATH.match(text)):
             written = repr(escape[1])[1:-1]
             what = f"in double quotes '{written}' is a control character, not a part of a path"
-            self.report(mark, what, "", _PATH_HINT)
+            self.report(mark, what, "", PATH_HINT)
         return Node(text, self._mark(mark))
 
 
@@ -408,117 +409,6 @@ def _check_characters(text: str, source: str, is_option: bool) -> None:
     raise Mark(source, *place).error(what, expected, hint)
 
 
-_PATH_HINT: Final = "put a path into single quotes, or write '/' or two backslashes for each backslash"
+PATH_HINT: Final = "put a path into single quotes, or write '/' or two backslashes for each backslash"
 _IN_WINDOWS_PATH: Final = re.compile(r"(?:[A-Za-z]:|\\\w[^/]*)([\0\a\b\t\n\v\f\r\x1b])\w")
 """A path such as "C:\\new" in double quotes, in which YAML reads an escape."""
-_QUOTE_IT: Final = "put text with special characters in single quotes"
-
-
-def explain_syntax_error(
-    error: MarkedYAMLError, text: str, last: Event | None, opened: YamlMark | None
-) -> Problem:
-    """Explain a syntax error, with its place: common mistakes in our own words, the others in PyYAML's.
-
-    Args:
-        last: The event before the error.
-        opened: The innermost bracket that is open at the error; None outside of brackets.
-
-    Returns:
-        The problem, with line and column but without a source.
-    """
-    problem = error.problem or ""
-    at = cast("YamlMark", error.problem_mark or error.context_mark)
-    since = error.context_mark or at
-    if text[at.index : at.index + 1] == "\t":
-        return _at(at, "there is a tab here", "spaces")
-    if "expected ':'" in problem:
-        return _missing_colon(text, since)
-    if problem.startswith("mapping values"):
-        return _stray_colon(text, at)
-    if opened and (problem.startswith("expected ',' or") or problem.endswith("'<stream end>'")):
-        return _wrong_in_brackets(text, opened, at)
-    if problem.startswith("expected <block end>"):
-        return _late_quote(last, at) or _out_of_place(text, since, at)
-    if "escape character" in problem or "expected escape sequence" in problem:
-        return _wrong_escape(text, at)
-    if "quoted scalar" in (error.context or "") and "unexpected" in problem:
-        return _at(since, "the quotation mark that opens here is never closed")
-    return _at(at, f"this is not valid YAML: {clean(problem.removeprefix('but '))}", "", _QUOTE_IT)
-
-
-def _at(mark: YamlMark, what: str, expected: str = "", hint: str = "") -> Problem:
-    return Problem(what, "", mark.line + 1, mark.column + 1, expected, hint)
-
-
-def _wrong_escape(text: str, at: YamlMark) -> Problem:
-    """Explain a backslash in double quotes, mostly of a path of Windows."""
-    start = text.rindex("\\", 0, at.index + 1)
-    escape = clean(text[start : start + 2])
-    what = f"in double quotes a backslash begins an escape, and '{escape}' is not a complete one"
-    return Problem(what, "", at.line + 1, at.column + 1 - (at.index - start), "", _PATH_HINT)
-
-
-def _missing_colon(text: str, since: YamlMark) -> Problem:
-    line = re.split(r"[\r\n]", text[since.index :], maxsplit=1)[0]
-    has_colon = ":" in line.partition(" #")[0]
-    what = "there is no space after the ':' of this line" if has_colon else "this line has no ':'"
-    return _at(since, what, "'key: value'")
-
-
-def _stray_colon(text: str, at: YamlMark) -> Problem:
-    """Explain a second colon on a line, or a line that is indented so that it continues the text above."""
-    before = text[at.index - at.column : at.index]
-    spaces = len(before) - len(before.lstrip())
-    above, line = _line_above(text, at)
-    if ": " not in before and line and spaces > above:
-        what = f"this line is indented further than line {line}, which has a value already"
-        return _at(at, what, f"{above} spaces as there")
-    hint = "put text that holds ': ' in quotes"
-    return _at(at, "a ':' is not allowed here", "one 'key: value' on a line", hint)
-
-
-def _line_above(text: str, at: YamlMark) -> tuple[int, int]:
-    """Column of the first key on the nearest line above that is not empty, and its number, from 1."""
-    lines = re.split(r"\r\n|\r|\n", text[: at.index])[:-1]
-    for number in range(len(lines), 0, -1):
-        if match := re.match(r" *(?:- +)*(?=[^ #])", lines[number - 1]):
-            return match.end(), number
-    return 0, 0
-
-
-def _wrong_in_brackets(text: str, opened: YamlMark, at: YamlMark) -> Problem:
-    """Explain an error in a list or mapping in brackets, on its first line or a later one."""
-    bracket = text[opened.index]
-    closer = "]" if bracket == "[" else "}"
-    expected = f"',' or '{closer}'"
-    if at.line == opened.line and at.index < len(text):
-        what = f"the {bracket}...{closer} that opens in column {opened.column + 1} goes wrong here"
-        return _at(at, what, expected)
-    return _at(opened, f"the '{bracket}' that opens here is not closed", expected)
-
-
-def _late_quote(last: Event | None, at: YamlMark) -> Problem | None:
-    """Explain a quoted text that ends lines too late, at the next quotation mark; None for other errors."""
-    if not isinstance(last, ScalarEvent) or last.style not in ("'", '"'):
-        return None
-    start, end = cast("YamlMark", last.start_mark), cast("YamlMark", last.end_mark)
-    if start.line == end.line or end.line != at.line:
-        return None
-    what = f"the quotation mark that opens here is closed only in line {end.line + 1}"
-    return _at(start, what, "a quotation mark at the end of the text")
-
-
-def _out_of_place(text: str, since: YamlMark, at: YamlMark) -> Problem:
-    """Explain a line that continues no block above it, or what follows a complete value on its line."""
-    if text[at.index - at.column : at.index].strip():
-        return _at(at, "this does not belong here", "the end of the line", _QUOTE_IT)
-    if at.column == since.column:
-        return _at(
-            at, "this line does not continue the block above", "'- ' in a list, 'key: value' otherwise"
-        )
-    what = "the indentation of this line fits no line above"
-    if text[at.index] == "-":
-        return _at(at, what, "that of the other items of the list")
-    above, line = _line_above(text, at)
-    other = f" or {since.column} as in line {since.line + 1}" if since.column != above else ""
-    return _at(at, what, f"{above} spaces as in line {line}{other}")

@@ -13,7 +13,8 @@ import pytest
 from pydantic import Field, field_validator, model_validator
 
 from labseq.config.document import Document
-from labseq.config.validation import MAX_HINTS, validate_values
+from labseq.config.validation import validate_values
+from labseq.config.validation_errors import MAX_HINTS
 from labseq.errors import ConfigError
 from labseq.settings import Duration, Fraction, Length, NoSettings, Settings
 
