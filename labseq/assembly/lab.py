@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from labseq import motion
 from labseq.assembly.plugin_choice import ChosenPlugin, construct_one
-from labseq.assembly.profile import ResolvedProfile
 from labseq.assembly.wiring import wrong_wiring
 from labseq.errors import ConfigError, LabseqError, PlanError
 from labseq.guard import Guard, StopFlag
@@ -23,9 +22,6 @@ from labseq.sequencer.lab import Lab
 
 if TYPE_CHECKING:
     from labseq.assembly.point import Point
-
-DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "eject_slots"})
-"""Keys of the motion that mobile tweezers need when they are opened; only the core uses the others."""
 
 
 def clock_for(stop: StopFlag, *, virtual: bool, paced: bool = False) -> Clock:
@@ -141,71 +137,6 @@ def choice_of(
         return guard.call("planner", WARM_S, planner.choose, target, window_s)
     finally:
         guard.end()
-
-
-def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:
-    """Construct the objects whose settings differ between two points; all others stay open.
-
-    A device whose settings change must be closed first and reopened afterwards. The mobile
-    tweezers stay open if the motion differs only in what each program contains. A
-    simulated lab stays open only if nothing of its devices and of the motion differs: its devices hold
-    on to the simulation, and that to the motion.
-
-    Args:
-        lab: The lab at the previous point.
-        before: The point that the lab is at.
-        after: The next point.
-
-    Returns:
-        The lab, and the names of the devices that must be reopened, "simulation" among them.
-    """
-    reopened = _reopened(lab, before.hardware, after.hardware)
-    motion = after.hardware.motion
-    names = {*reopened, "planner"}
-    if _differs(before.hardware, after.hardware, "detector"):
-        names.add("detector")
-    chosen = {**after.hardware.chosen, "planner": after.planner}
-    objects, streams = construct(
-        {name: chosen[name] for name in chosen if name in names},
-        replace(after.hardware.context(lab.clock), simulation=lab.simulation),
-        seed,
-        truth=(after.hardware.profile.grid_model(), after.hardware.profile.motion),
-    )
-    roles = ("camera", "static_tweezers", "mobile_tweezers", "detector", "planner", "lines", "simulation")
-    return replace(
-        lab,
-        **{role: objects[role] for role in roles if role in objects},
-        devices={name: objects.get(name, device) for name, device in lab.devices.items()},
-        motion=motion,
-        planner_name=after.planner.entry.name,
-        degree_of_parallelism=parallelism_of(after.planner, objects["planner"], motion),
-        random_streams=_streams(lab.random_streams, streams),
-    ), reopened
-
-
-def _reopened(lab: Lab, before: ResolvedProfile, after: ResolvedProfile) -> frozenset[str]:
-    names = {name for name, _ in lab.hardware()} | ({"simulation"} if lab.simulation is not None else set())
-    changed = {name for name in names if _differs(before, after, name)}
-    old, new = before.profile.motion, after.profile.motion
-    moved = {
-        field.name for field in fields(MotionSpec) if getattr(old, field.name) != getattr(new, field.name)
-    }
-    if lab.simulation is not None:
-        return frozenset(names if changed or moved else ())
-    if moved & DRIVERS_MOTION:
-        changed.add("mobile_tweezers")
-    return frozenset(changed)
-
-
-def _differs(before: ResolvedProfile, after: ResolvedProfile, name: str) -> bool:
-    old, new = before.chosen[name], after.chosen[name]
-    return (old.entry, old.settings) != (new.entry, new.settings)
-
-
-def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tuple[RandomStream, ...]:
-    """Random streams of a lab: those of new objects, and the earlier ones of objects that stay."""
-    names = {stream.name for stream in new}
-    return (*(stream for stream in old if stream.name not in names), *new)
 
 
 def parallelism_of(chosen: ChosenPlugin, planner: Any, motion: MotionSpec) -> int:

@@ -1,7 +1,8 @@
 """The settings of a run at each point of its scan: values put into the files, and validated as those are.
 
 A scan has many points, but few different settings: those of a plugin are validated once for each content
-that the points give them. Devices are constructed later, when the run opens or by ``labseq check``.
+that the points give them. Devices are constructed later, when the run opens or by ``labseq check``; between
+two points only those are constructed again whose settings differ.
 """
 
 from __future__ import annotations
@@ -9,24 +10,28 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from labseq.assembly.lab import construct, parallelism_of
 from labseq.assembly.plugin_choice import resolve
 from labseq.assembly.point import Configured, Point, make_step
+from labseq.assembly.profile import ResolvedProfile, choose
 from labseq.config.addresses import PROFILE, PROFILE_ROLES, VARIABLES
+from labseq.config.profile import MobileTweezersChoice
 from labseq.config.scan import Axis, Scan, put
 from labseq.errors import ConfigError, Loc, ProblemCollector
 from labseq.messages import clean
+from labseq.model import MotionSpec, RandomStream
 from labseq.settings import Choice
 from labseq.units import parse_any
 
 if TYPE_CHECKING:
-    from labseq.assembly.profile import ResolvedProfile
     from labseq.config.document import Document
     from labseq.config.sequence import SequenceSpec
     from labseq.config.yaml_nodes import Node
+    from labseq.sequencer.lab import Lab
 
 MAX_PROBLEMS: Final = 20
 """The check of a scan stops after this number of problems."""
@@ -157,7 +162,7 @@ class ScanPoints:
             return self.hardware
 
         def change() -> ResolvedProfile:
-            return self.hardware.changed(put(values, self.hardware.document, profile=True))
+            return _changed(self.hardware, put(values, self.hardware.document, profile=True))
 
         return self._once(json.dumps(own), change)
 
@@ -200,6 +205,37 @@ class ScanPoints:
                     raise axis.key.error(what, "one value of it for the whole run")
 
 
+def _changed(hardware: ResolvedProfile, document: Document) -> ResolvedProfile:
+    """A profile with other settings of its plugins; drivers, grid and calibrations stay the same.
+
+    Args:
+        document: The profile's file with the other settings.
+
+    Raises:
+        ConfigError: All that is wrong with them.
+    """
+    problems, chosen, profile = ProblemCollector(), dict(hardware.chosen), hardware.profile
+    for role, choice in {**profile.choices, **profile.devices}.items():
+        loc = choice.loc
+        if document.get(loc) == hardware.document.get(loc):
+            continue
+        with problems:
+            new_choice = document.validate(type(choice), loc).placed(*loc)
+            is_hardware = chosen[role].entry.role.is_hardware
+            if is_hardware and new_choice.use != choice.use:
+                what = f"a scan cannot change the driver of {role}"
+                raise document.error((*loc, "use"), what, "one driver for the whole run")
+            plugin, _ = choose(hardware.host, document, profile, role, new_choice, hardware.dry_run)
+            if is_hardware and plugin.virtual_time != chosen[role].virtual_time:
+                what = f"the scan would change whether {role} is simulated"
+                raise document.error(loc, what, "all points simulated, or none")
+            chosen[role] = plugin
+            if isinstance(new_choice, MobileTweezersChoice):
+                profile = profile.model_copy(update={"mobile_tweezers": new_choice})
+    problems.raise_any()
+    return replace(hardware, document=document, profile=profile, chosen=chosen)
+
+
 def _may_be_scanned(of_profile: bool, loc: Loc) -> bool:
     if of_profile:
         return loc[0] in PROFILE_ROLES or (loc[0] == "devices" and len(loc) > 2)
@@ -229,3 +265,72 @@ def _setting(
 def _si(value: Any) -> Any:
     """The value of a variable in SI."""
     return parse_any(value)[0] if isinstance(value, str) else value
+
+
+DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "eject_slots"})
+"""Keys of the motion that mobile tweezers need when they are opened; only the core uses the others."""
+
+
+def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:
+    """Construct the objects whose settings differ between two points; all others stay open.
+
+    A device whose settings change must be closed first and reopened afterwards. The mobile
+    tweezers stay open if the motion differs only in what each program contains. A
+    simulated lab stays open only if nothing of its devices and of the motion differs: its devices hold
+    on to the simulation, and that to the motion.
+
+    Args:
+        lab: The lab at the previous point.
+        before: The point that the lab is at.
+        after: The next point.
+
+    Returns:
+        The lab, and the names of the devices that must be reopened, "simulation" among them.
+    """
+    reopened = _reopened(lab, before.hardware, after.hardware)
+    motion = after.hardware.motion
+    names = {*reopened, "planner"}
+    if _differs(before.hardware, after.hardware, "detector"):
+        names.add("detector")
+    chosen = {**after.hardware.chosen, "planner": after.planner}
+    objects, streams = construct(
+        {name: chosen[name] for name in chosen if name in names},
+        replace(after.hardware.context(lab.clock), simulation=lab.simulation),
+        seed,
+        truth=(after.hardware.profile.grid_model(), after.hardware.profile.motion),
+    )
+    roles = ("camera", "static_tweezers", "mobile_tweezers", "detector", "planner", "lines", "simulation")
+    return replace(
+        lab,
+        **{role: objects[role] for role in roles if role in objects},
+        devices={name: objects.get(name, device) for name, device in lab.devices.items()},
+        motion=motion,
+        planner_name=after.planner.entry.name,
+        degree_of_parallelism=parallelism_of(after.planner, objects["planner"], motion),
+        random_streams=_streams(lab.random_streams, streams),
+    ), reopened
+
+
+def _reopened(lab: Lab, before: ResolvedProfile, after: ResolvedProfile) -> frozenset[str]:
+    names = {name for name, _ in lab.hardware()} | ({"simulation"} if lab.simulation is not None else set())
+    changed = {name for name in names if _differs(before, after, name)}
+    old, new = before.profile.motion, after.profile.motion
+    moved = {
+        field.name for field in fields(MotionSpec) if getattr(old, field.name) != getattr(new, field.name)
+    }
+    if lab.simulation is not None:
+        return frozenset(names if changed or moved else ())
+    if moved & DRIVERS_MOTION:
+        changed.add("mobile_tweezers")
+    return frozenset(changed)
+
+
+def _differs(before: ResolvedProfile, after: ResolvedProfile, name: str) -> bool:
+    old, new = before.chosen[name], after.chosen[name]
+    return (old.entry, old.settings) != (new.entry, new.settings)
+
+
+def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tuple[RandomStream, ...]:
+    """Random streams of a lab: those of new objects, and the earlier ones of objects that stay."""
+    names = {stream.name for stream in new}
+    return (*(stream for stream in old if stream.name not in names), *new)

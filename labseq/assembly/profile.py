@@ -12,7 +12,7 @@ from labseq.assembly.options import DryRun
 from labseq.assembly.plugin_choice import ChosenPlugin, load_plugins, resolve
 from labseq.config.addresses import Override
 from labseq.config.document import Document, plugin_paths
-from labseq.config.profile import DeviceChoice, MobileTweezersChoice, ProfileSpec, load_profile
+from labseq.config.profile import DeviceChoice, ProfileSpec, load_profile
 from labseq.errors import (
     ConfigError,
     PluginLoadError,
@@ -91,36 +91,6 @@ class ResolvedProfile:
         if name == "mobile_tweezers":
             settings |= self.profile.mobile_tweezers.model_dump(mode="json", exclude={"use"})
         return settings
-
-    def changed(self, document: Document) -> ResolvedProfile:
-        """The profile with other settings of its plugins; drivers, grid and calibrations stay the same.
-
-        Args:
-            document: The profile's file with the other settings.
-
-        Raises:
-            ConfigError: All that is wrong with them.
-        """
-        problems, chosen, profile = ProblemCollector(), dict(self.chosen), self.profile
-        for role, choice in {**profile.choices, **profile.devices}.items():
-            loc = choice.loc
-            if document.get(loc) == self.document.get(loc):
-                continue
-            with problems:
-                new_choice = document.validate(type(choice), loc).placed(*loc)
-                is_hardware = chosen[role].entry.role.is_hardware
-                if is_hardware and new_choice.use != choice.use:
-                    what = f"a scan cannot change the driver of {role}"
-                    raise document.error((*loc, "use"), what, "one driver for the whole run")
-                plugin, _ = choose(self.host, document, profile, role, new_choice, self.dry_run)
-                if is_hardware and plugin.virtual_time != chosen[role].virtual_time:
-                    what = f"the scan would change whether {role} is simulated"
-                    raise document.error(loc, what, "all points simulated, or none")
-                chosen[role] = plugin
-                if isinstance(new_choice, MobileTweezersChoice):
-                    profile = profile.model_copy(update={"mobile_tweezers": new_choice})
-        problems.raise_any()
-        return replace(self, document=document, profile=profile, chosen=chosen)
 
     @property
     def key(self) -> str:

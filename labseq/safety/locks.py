@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -11,15 +10,11 @@ from typing import Final
 from labseq.assembly.profile import ResolvedProfile
 from labseq.errors import DeviceError
 from labseq.files import make_shared
-from labseq.processes import Holder, Lock, Process
+from labseq.processes import Holder, Lock
 from labseq.recording import lock_file
 
 BEAT_S: Final = 0.5
 """Time between two signs of life of a process that uses devices, in seconds."""
-END_S: Final = 10.0
-"""Time that a process has after SIGTERM to make its devices safe before it is killed, in seconds."""
-HUNG_END_S: Final = 0.5
-"""Time before a process that hangs is killed, as it cannot obey SIGTERM, in seconds."""
 
 
 @contextmanager
@@ -100,39 +95,3 @@ def _beating(locks: Sequence[Lock]) -> Generator[None]:
 def device_text(role: str, identity: str) -> str:
     """A device with what identifies it, for the user."""
     return role if identity.startswith(f"{role} ") else f"{role} ({identity})"
-
-
-def end_holders(
-    profile: str, warn: Callable[[str], object], may_end: Callable[[str], bool]
-) -> Callable[[str, Holder], bool]:
-    """A function for ``blocked`` of :func:`lock_devices` that ends each process that uses devices, once.
-
-    Args:
-        profile: The profile, as it is named in commands.
-        warn: Receives a line for each thing that is done.
-        may_end: Asked whether to end a process that does not hang; receives which device it uses.
-    """
-    tried = set[Process | None]()
-
-    def has_ended(device: str, holder: Holder) -> bool:
-        process, text = holder.process, f"{device} is in use by {holder}"
-        if process in tried:
-            return False
-        tried.add(process)  # once: it is not killed again if it still holds the next device
-        is_other = process is not None and process.is_here and process.pid != os.getpid()
-        if process is None or not is_other or not (holder.hangs or may_end(text)):
-            hint = f"; 'labseq safe {profile} --end' ends that process first" if is_other else ""
-            warn(f"{text}; making it safe anyway, as far as that is possible{hint}")
-            return False
-        silent = f", which has not answered for {holder.silent_s:.0f} s" if holder.hangs else ""
-        warn(f"{text}{silent}; that process is ended first")
-        try:
-            ended = process.end(HUNG_END_S if holder.hangs else END_S)
-        except OSError as error:
-            warn(f"process {process.pid} cannot be ended: {error.strerror}")
-            return False
-        if not ended:
-            warn(f"process {process.pid} did not end")
-        return ended
-
-    return has_ended

@@ -33,11 +33,16 @@ from labseq.processes import HANG_S, Holder, Lock, Process
 from labseq.recording import clear_active, lock_file
 from labseq.recording.run_file import describe_end
 from labseq.roles import Clock, Hardware, RunObserver, Simulation, in_safe_order
-from labseq.safety.locks import device_text, end_holders, lock_devices
+from labseq.safety.locks import device_text, lock_devices
 from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.sequencer.lab import attempt, failure_of, open_device
 from labseq.watchdog import Watchdog, watchdog_lines
 from labseq.watchdog_process import TRY_AGAIN_S, Hanging
+
+END_S: Final = 10.0
+"""Time that a process has after SIGTERM to make its devices safe before it is killed, in seconds."""
+HUNG_END_S: Final = 0.5
+"""Time before a process that hangs is killed, as it cannot obey SIGTERM, in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,3 +346,39 @@ class _DeviceWatch:
             return False
         hangs = self._hanging.setdefault(process, Hanging(process.pid, HANG_S))
         return not holder.is_running or hangs(holder.silent_s)
+
+
+def end_holders(
+    profile: str, warn: Callable[[str], object], may_end: Callable[[str], bool]
+) -> Callable[[str, Holder], bool]:
+    """A function for ``blocked`` of :func:`lock_devices` that ends each process that uses devices, once.
+
+    Args:
+        profile: The profile, as it is named in commands.
+        warn: Receives a line for each thing that is done.
+        may_end: Asked whether to end a process that does not hang; receives which device it uses.
+    """
+    tried = set[Process | None]()
+
+    def has_ended(device: str, holder: Holder) -> bool:
+        process, text = holder.process, f"{device} is in use by {holder}"
+        if process in tried:
+            return False
+        tried.add(process)  # once: it is not killed again if it still holds the next device
+        is_other = process is not None and process.is_here and process.pid != os.getpid()
+        if process is None or not is_other or not (holder.hangs or may_end(text)):
+            hint = f"; 'labseq safe {profile} --end' ends that process first" if is_other else ""
+            warn(f"{text}; making it safe anyway, as far as that is possible{hint}")
+            return False
+        silent = f", which has not answered for {holder.silent_s:.0f} s" if holder.hangs else ""
+        warn(f"{text}{silent}; that process is ended first")
+        try:
+            ended = process.end(HUNG_END_S if holder.hangs else END_S)
+        except OSError as error:
+            warn(f"process {process.pid} cannot be ended: {error.strerror}")
+            return False
+        if not ended:
+            warn(f"process {process.pid} did not end")
+        return ended
+
+    return has_ended

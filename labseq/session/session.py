@@ -12,17 +12,16 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, ParamSpec, Self
 
 from labseq.assembly.assemble import Assembly, assemble
-from labseq.assembly.lab import rebuild_lab
 from labseq.assembly.options import DryRun, Options, path_of
 from labseq.assembly.point import Point
 from labseq.data.reader import Run, open_run
-from labseq.errors import ConfigError, DeviceError, RecordingError
+from labseq.errors import ConfigError, DeviceError, RecordingError, StopRequested
 from labseq.guard import stop_on_signals
 from labseq.messages import error_text, visible
 from labseq.model import RunRecord, ShotRecord
 from labseq.realtime import real_time
 from labseq.recording import clear_active, data_root, find_dead_run, mark_active
-from labseq.recording.folders import NOTIFY_FILE, SOURCES_FILE, later_day
+from labseq.recording.folders import NOTIFY_FILE, SOURCES_FILE, STOP_FILE, later_day
 from labseq.recording.index import IndexRow
 from labseq.recording.writer import RunWriter
 from labseq.roles import RunObserver
@@ -36,7 +35,6 @@ from labseq.session.checks import Checks
 from labseq.session.prepared import PreparedRun
 from labseq.session.provenance import code_of, copies, ending, notes_file, run_record
 from labseq.session.sources import RunCode
-from labseq.session.stopping import check_stop_file
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
 if TYPE_CHECKING:
@@ -124,7 +122,8 @@ class Shots:
         if why:  # an earlier process may have died before it could record what it skips
             self._skip(history.later_at_its_point(last), why)
         while (point := points.next(history)) is not None:
-            check_stop_file(self._writer.run_dir)
+            if (self._writer.run_dir / STOP_FILE).exists():  # `labseq stop` in another process
+                raise StopRequested(signal.SIGTERM, after_shot=True)
             shot = history.to_take[0]
             self._move_to(point)
             failure = self.sequencer.take(shot)
@@ -143,6 +142,8 @@ class Shots:
         """Change what differs between the present point and the next."""
         if point is self._point:
             return
+        from labseq.assembly.points import rebuild_lab  # only scans have several points
+
         lab, reopened = rebuild_lab(self.sequencer.lab, self._point, point, self._run.seed)
         if lab.planner is not self.sequencer.lab.planner:
             self._run.choose_planner(lab, point)  # not in the shot, whose atoms would wait

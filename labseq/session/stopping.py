@@ -1,13 +1,12 @@
-"""Stopping a run after its current shot, from another process: `labseq stop`."""
+"""Asks a run in another process to end after its current shot: `labseq stop`."""
 
 from __future__ import annotations
 
-import signal
 from dataclasses import asdict
 from pathlib import Path
 
 from labseq.config.find import find_profile
-from labseq.errors import ConfigError, Problem, StopRequested
+from labseq.errors import ConfigError, Problem
 from labseq.files import write_file
 from labseq.plain import dumps
 from labseq.processes import Process
@@ -23,16 +22,6 @@ def ask_to_stop(run_dir: Path) -> None:
         RecordingError: Its folder cannot be written to.
     """
     write_file(run_dir / STOP_FILE, dumps(asdict(Process.current())).encode() + b"\n")
-
-
-def check_stop_file(run_dir: Path) -> None:
-    """Raise if another process has asked a run to end.
-
-    Raises:
-        StopRequested: Another process has.
-    """
-    if (run_dir / STOP_FILE).exists():
-        raise StopRequested(signal.SIGTERM, after_shot=True)
 
 
 def is_running(run_dir: Path) -> bool:

@@ -139,7 +139,7 @@ def test_a_process_that_hangs_or_is_to_end_is_ended_before_its_devices_are_made_
     end: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("END_S", "HUNG_END_S"):
-        monkeypatch.setattr(f"labseq.safety.locks.{name}", 0.1)
+        monkeypatch.setattr(f"labseq.safety.safe.{name}", 0.1)
     seen, file = RecordingObserver(), lock_file(*resolve_profile("./p.yaml").identities)
     command = [sys.executable, "-c", HOLD, str(file)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:

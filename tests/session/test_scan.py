@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import labseq
-from labseq.assembly.lab import rebuild_lab
-from labseq.assembly.points import MAX_PROBLEMS
+from labseq.assembly.points import MAX_PROBLEMS, rebuild_lab
 from labseq.data.points import scan_points
 from labseq.errors import ConfigError
 from labseq.session.check import check
