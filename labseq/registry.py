@@ -69,14 +69,13 @@ class Entry:
             ``"package.module:Name"``; they are imported when something first needs them.
         settings_model: pydantic model of its settings, a subclass of
             ``labseq.plugin.Settings``, or its place; None if it takes none.
-        origin: Name of the plugin that registered it.
+        owner: The plugin that registered it.
         virtual_time: Whether it keeps to the session's clock only, so that a run
             need not wait in real time.
         simulated: Settings that make a driver use its simulated device, for
             example ``{"card": "simulated"}``; None if it has none. A dry run gives them;
             a driver that has them keeps to the session's clock. A place may be that of a function
             that returns them, or a text: why the device cannot be simulated on this computer.
-        owner: The plugin that registered it.
         no_simulator: Why the device cannot be simulated on this computer; "" if it can.
         units: Units of the parameters of a fit, see :meth:`Registry.fit`.
     """
@@ -85,12 +84,16 @@ class Entry:
     name: str
     factory: Factory
     settings_model: type[Any] | None
-    origin: str
+    owner: Owner = field(compare=False, repr=False)
     virtual_time: bool = False
     simulated: Mapping[str, Any] | None = None
-    owner: Owner = field(default=Owner("labseq"), compare=False, repr=False)
     no_simulator: str = ""
     units: Mapping[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def origin(self) -> str:
+        """Name of the plugin that registered it."""
+        return self.owner.name
 
     @property
     def role(self) -> Role:
@@ -172,9 +175,8 @@ class Registry:
             if taken.origin != self._owner.name:
                 self.contested[kind, name] = error
             raise error
-        parts: tuple[Any, Any, Any] = factory, settings_model, simulated
-        entry = Entry(kind, name, *parts[:2], self._owner.name, virtual_time, parts[2], self._owner)
-        entry = replace(entry, units=units or {})
+        parts: tuple[Any, Any, Any] = factory, settings_model, simulated  # of any type until they are checked
+        entry = Entry(kind, name, *parts[:2], self._owner, virtual_time, parts[2], units=units or {})
         if not entry.is_place:
             _check(entry)
         self._entries[kind, name] = entry

@@ -6,6 +6,7 @@ from abc import ABC
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from labseq.roles import Context
 from labseq.settings import Choice, NoSettings, Settings
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ChosenPlugin:
     """A registry entry and the settings it will be constructed with.
 
@@ -48,7 +49,7 @@ class ChosenPlugin:
     loc: Loc = ()
     by_line: bool = False
 
-    @property
+    @cached_property
     def virtual_time(self) -> bool:
         """Whether the plugin needs no real time: always, or with its present settings."""
         simulated = self.entry.simulated

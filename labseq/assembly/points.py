@@ -221,7 +221,7 @@ def _changed(hardware: ResolvedProfile, document: Document) -> ResolvedProfile:
             continue
         with problems:
             new_choice = document.validate(type(choice), loc).placed(*loc)
-            is_hardware = chosen[role].entry.role.is_hardware
+            is_hardware = role in hardware.drivers
             if is_hardware and new_choice.use != choice.use:
                 what = f"a scan cannot change the driver of {role}"
                 raise document.error((*loc, "use"), what, "one driver for the whole run")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from labseq.config.scan import Scan
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ResolvedProfile:
     """A profile with its plugins chosen, before anything is opened.
 
@@ -98,17 +99,23 @@ class ResolvedProfile:
         path = str(self.document.path.resolve())
         return path if self.dry_run == "off" else f"{path} (dry run)"
 
-    @property
+    @cached_property
+    def drivers(self) -> Mapping[str, ChosenPlugin]:
+        """Role or device name -> its plugin; without the detector and the simulation."""
+        return {role: plugin for role, plugin in self.chosen.items() if plugin.entry.role.is_hardware}
+
+    @cached_property
     def identities(self) -> Mapping[str, str]:
         """What only one process can use of its hardware -> the role or device that uses it."""
-        hardware = [(role, plugin) for role, plugin in self.chosen.items() if plugin.entry.role.is_hardware]
-        return {identity: role for role, plugin in hardware for identity in plugin.identities(role)}
+        # asked once: a run must unlock what it has locked, whatever a plugin answers later
+        return {
+            identity: role for role, plugin in self.drivers.items() for identity in plugin.identities(role)
+        }
 
-    @property
+    @cached_property
     def virtual_time(self) -> bool:
         """Whether no device needs real time, so that the clock can be virtual."""
-        hardware = [plugin for plugin in self.chosen.values() if plugin.entry.role.is_hardware]
-        return self.dry_run != "off" or all(plugin.virtual_time for plugin in hardware)
+        return self.dry_run != "off" or all(plugin.virtual_time for plugin in self.drivers.values())
 
 
 def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, problems: ProblemCollector) -> None:

@@ -39,9 +39,7 @@ def readings_of(
     """
     if not is_whole or hardware.dry_run != "off":  # in a dry run others stand in for devices
         yield _READING
-    for name, plugin in hardware.chosen.items():
-        if not plugin.entry.role.is_hardware:
-            continue
+    for name, plugin in hardware.drivers.items():
         factory = plugin.entry.factory
         polled: Collection[str] | None = getattr(plugin.settings, "polled", None)
         if polled is not None:

@@ -25,8 +25,8 @@ def wrong_wiring(document: Document, lab: Lab) -> Iterator[Problem]:
         document: The profile's file.
         lab: The devices, not open.
     """
-    camera, specs = lab.step_context.camera, lab.line_specs
-    channels = lab.step_context.lines_facts.channels
+    camera, specs = lab.camera.facts, lab.line_specs
+    channels = () if lab.lines is None else lab.lines.lines_facts.channels
     for spec in (spec for spec in specs if channels and spec.channel not in channels):
         loc = ("lines", "channels", spec.name, "channel")
         expected = f"one of {', '.join(map(str, channels))}"

@@ -66,8 +66,7 @@ def check_campaign(campaign: Campaign, *, in_turn: bool) -> CampaignInputs:
             raise campaign.placed(error, run) from error
         assembly = session.assembly
         if not (in_turn or assembly.virtual_time):
-            plugins_by_role = assembly.hardware.chosen.items()
-            real = [r for r, p in plugins_by_role if p.entry.role.is_hardware and not p.virtual_time]
+            real = [role for role, driver in assembly.hardware.drivers.items() if not driver.virtual_time]
             what = f"the profile '{assembly.hardware.profile.name}' has real hardware ({', '.join(real)})"
             expected = "simulated hardware, to take several runs at once"
             raise ConfigError(Problem(what, expected=expected, hint="leave out --workers and --scheduler"))

@@ -102,7 +102,7 @@ class CameraSeries:
     def __init__(
         self, lab: Lab, timelines: Sequence[Sequence[TimelineEntry]], call: Callable[..., Any]
     ) -> None:
-        facts = lab.step_context.camera
+        facts = lab.camera.facts
         self.by_line = trigger_line(lab.line_specs, "camera") is not None
         self._camera, self._specs, self._call, self._timelines = lab.camera, lab.line_specs, call, timelines
         self.arm_s = facts.arm_s

@@ -46,7 +46,7 @@ def check_blinding(lab: Lab, guard: Guard) -> None:
     Raises:
         DeviceError: Such a light is on; nothing was exposed.
     """
-    em_gain = lab.step_context.camera.em_gain
+    em_gain = lab.camera.facts.em_gain
     if em_gain <= 1.0:
         return
     if lines := blinding_lines(lab.line_specs, "image"):

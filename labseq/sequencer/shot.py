@@ -499,7 +499,7 @@ class RunningShot:
     def _expose(self, exposure_s: float, cycle: int) -> object:
         """Take a frame; the stage "read_out" begins at the end of the exposure."""
         camera, specs, timeout_s = self.lab.camera, self.lab.line_specs, self.call_timeout_s
-        limit_s, readout_s = timeout_s + exposure_s, self.lab.step_context.camera.readout_s
+        limit_s, readout_s = timeout_s + exposure_s, self.lab.camera.facts.readout_s
         if not self.series.is_ready(exposure_s):
             with self.stage("arm", self.series.arm_s, cycle):
                 self.series.arm(exposure_s)
