@@ -193,6 +193,7 @@ def can_blend(words: Words, i: int, shared: bool, anchors: NDArray[np.int64]) ->
 def choose(words: Words, i: int, shared: bool) -> int:
     """Choose the path of segment ``i``, and find the groups of its tones."""
     axis, loud, moving = axis_of(words), False, False
+    n_tones = axis.offsets[i + 1] - axis.offsets[i]
     for k in range(axis.offsets[i], axis.offsets[i + 1]):
         loud = loud or axis.tones[START_AMPLITUDE, k] > 0.0 or axis.tones[END_AMPLITUDE, k] > 0.0
         moving = moving or axis.tones[START, k] != axis.tones[END, k]
@@ -204,8 +205,8 @@ def choose(words: Words, i: int, shared: bool) -> int:
     for near in (0.5 * ON_TOOTH, NEAR_TOOTH):
         n_groups = find_groups(words, i, shared, near, anchors)
         if n_groups > 0 and shared and near < ON_TOOTH:
-            return COMB
-        is_worth_it = 0 < BLENDED_COST * n_groups < axis.offsets[i + 1] - axis.offsets[i]
+            return DIRECT if moving and n_groups == n_tones else COMB  # a single tone is faster by itself
+        is_worth_it = 0 < BLENDED_COST * n_groups < n_tones
         if is_worth_it and can_blend(words, i, shared, anchors):
             return BLENDED
     return DIRECT
