@@ -16,7 +16,6 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,7 +46,7 @@ CHUNK: Final = 1 << 18
 """Samples that are rendered at a time, as by a card's driver."""
 PLANNERS: Final[dict[str, tuple[Any, Any]]] = {
     "psca": (PscaPlanner, PscaSettings),
-    "grid": (GridPlanner, partial(GridSettings, lanes="straight")),
+    "grid": (GridPlanner, GridSettings),
     "tetris": (TetrisPlanner, LineSettings),
     "mta1": (Mta1Planner, LineSettings),
 }
