@@ -75,18 +75,29 @@ class AwgCard:
         self.spcm.spcm_vClose(self._handle)
         self.library.disconnect()
 
-    def clear_error(self) -> str:
-        """Read the pending error: until then the driver library refuses every other call."""
-        text = ctypes.create_string_buffer(self.spcm.ERRORTEXTLEN)
-        self.spcm.spcm_dwGetErrorInfo_i32(self._handle or None, None, None, ctypes.byref(text))
-        return " ".join(text.value.decode(errors="replace").split())
+    def clear_error(self, code: int = 0) -> str:
+        """Read the pending error: until then the driver library refuses every other call.
+
+        Args:
+            code: What the refused function returned; named if the library has no text for it.
+        """
+        spcm = self.spcm
+        buffer = ctypes.create_string_buffer(spcm.ERRORTEXTLEN)
+        pending = spcm.spcm_dwGetErrorInfo_i32(self._handle or None, None, None, ctypes.byref(buffer))
+        text = " ".join(buffer.value.decode(errors="replace").split())
+        return text or self._error_name(code or pending)
+
+    def _error_name(self, code: int) -> str:
+        """The vendor's name and number of an error."""
+        errors = (name for name, value in vars(self.spcm).items() if value == code and name[:4] == "ERR_")
+        return f"{next(errors, 'error')} ({code:#x})"
 
     def _check(self, code: int, action: str) -> None:
         """Raise the error that a function of the driver library has returned."""
         if code == self.spcm.ERR_TIMEOUT:
             raise DeviceTimeoutError(self.name, f"{action}: the card's driver timed out", 0.0)
         if code:
-            raise DeviceError(self.name, f"{action}: {self.clear_error()}")
+            raise DeviceError(self.name, f"{action}: {self.clear_error(code)}")
 
     @property
     def handle(self) -> int:
@@ -115,6 +126,11 @@ class AwgCard:
     def running(self) -> bool:
         """Whether it was started and has not come to its end."""
         return not self.status & self.spcm.M2STAT_CARD_READY
+
+    @property
+    def ran_dry(self) -> bool:
+        """Whether a stream has ended for want of samples; the manual does not say that it is ready then."""
+        return bool(self.status & self.spcm.M2STAT_DATA_OVERRUN)
 
     @property
     def triggered(self) -> bool:
@@ -168,6 +184,30 @@ class AwgCard:
             ),
             "naming the transfer buffer",
         )
+
+    def wait_for_transfer(self, handed_bytes: int) -> None:
+        """Wait until a stream's transfer has reported its first block, as M2CMD_DATA_WAITDMA does.
+
+        The command is not used, because it cannot be interrupted.
+
+        Args:
+            handed_bytes: What the card may fetch, for the message.
+
+        Raises:
+            DeviceTimeoutError: It has not within ``TRANSFER_TIMEOUT_S``.
+        """
+        deadline_s = self.clock.now() + TRANSFER_TIMEOUT_S
+        while not self.status & self.spcm.M2STAT_DATA_BLOCKREADY:
+            if self.clock.now() > deadline_s:
+                fetched = self.read(self.spcm.SPC_DATA_AVAIL_USER_LEN)
+                raise self.not_fetched(fetched, handed_bytes)
+            self.clock.sleep(POLL_S)
+
+    def not_fetched(self, fetched_bytes: int, expected_bytes: int) -> DeviceTimeoutError:
+        """The error of a stream that cannot be started."""
+        text = f"the card fetched {fetched_bytes} of {expected_bytes} bytes, and was not started"
+        hint = "use mode: replay, and see the card's bus in Spectrum's Control Center"
+        return DeviceTimeoutError(self.name, f"{text}; {hint}", TRANSFER_TIMEOUT_S)
 
     def upload(self, frames: NDArray[np.int16], poll_s: float = POLL_S) -> None:
         """Transfer samples to the on-board memory, and wait until they have arrived.

@@ -69,6 +69,10 @@ class VendorLibrary:
         """
         return False
 
+    def step_time_s(self) -> float:
+        """The time of the step that is being called: there are none."""
+        return 0.0
+
     def emergency(self, script: Path) -> Emergency | None:
         """The driver's script that switches the card off from another process, with the vendor's library."""
         return Emergency(script, {"library": LIBRARY, "card": self._device_name})

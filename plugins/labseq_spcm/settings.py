@@ -85,10 +85,10 @@ class SpcmSettings(Settings):
         "programs begin at multiples of it",
     )
     card_buffer: int = Field(
-        default=1 << 16,
-        ge=1 << 12,
+        default=1 << 17,
+        ge=1 << 13,
         le=1 << 24,
-        description="stream: bytes of on-board memory that are used, a power of two, at least notify_size",
+        description="stream: bytes of on-board memory that are used, a power of two, at least 2 notify_size",
     )
     keep_warm: KeepWarmSettings | None = Field(
         default=None, description="stream: tones off the atoms between programs; none: silence"
@@ -139,10 +139,10 @@ class SpcmSettings(Settings):
             return self
         if self.trigger == "external":
             raise ValueError(f"mode: stream {NO_TRIGGER}")
-        if self.card_buffer < self.notify_size:
-            raise ValueError(
-                f"card_buffer is {self.card_buffer}; expected at least notify_size, {self.notify_size}"
-            )
+        if self.card_buffer < 2 * self.notify_size:
+            least = f"at least twice notify_size, {2 * self.notify_size}"
+            why = "the card reports whole blocks, and is started when it has one"
+            raise ValueError(f"card_buffer is {self.card_buffer}; expected {least}: {why}")
         least_s = self._buffered_s(self.sample_rate)
         if self.look_ahead is not None and self.look_ahead < least_s:
             look_ahead, least = (format_quantity(s, "time") for s in (self.look_ahead, least_s))

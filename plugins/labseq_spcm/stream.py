@@ -154,7 +154,8 @@ class Stream(PlayMode):
         self._row_channel = settings.row_channel
         self._block = block = settings.notify_size // FRAME_BYTES
         self._on_card = (settings.card_buffer + OUTPUT_FIFO_BYTES) // FRAME_BYTES
-        self._to_start = settings.card_buffer // FRAME_BYTES // block * block
+        # a block less than the whole: the card may keep some bytes for itself, and reports whole blocks
+        self._to_start = settings.card_buffer // FRAME_BYTES // block * block - block
         ahead = settings.look_ahead_s(sample_rate_hz) * sample_rate_hz - self._on_card
         self._ahead = max(2, int(ahead / block)) * block
         self.delay_s = (self._ahead + self._on_card) / sample_rate_hz
@@ -355,6 +356,7 @@ class Stream(PlayMode):
         pause_s = self._step(self._box, 0)
         if pause_s != 0.0:
             return pause_s
+        self._box[k.NOW_NS] = round(1e9 * self._card.library.step_time_s())
         code = k.supply(self._box, int(self._rate_hz))
         return self._step(self._box, code) if code < 0 else 1e-9 * code
 
@@ -396,19 +398,22 @@ class Stream(PlayMode):
 
     def _error(self) -> DeviceError:
         """The error that the library reported to the loop."""
-        return DeviceError(self._card.name, f"supplying the card: {self._card.clear_error()}")
+        reason = self._card.clear_error(int(self._box[k.ERROR]))
+        return DeviceError(self._card.name, f"supplying the card: {reason}")
 
     def _recover(self, code: int) -> None:
         """The card ran dry, or was too fast: begin again, with the program if it cannot have begun.
 
         Raises:
             TransientError: In the middle of a program.
-            DeviceError: The card runs, but the library reports an error.
+            DeviceError: The card runs, but the library reports an error; or it does not fetch samples.
         """
-        box = self._box
+        box, card = self._box, self._card
+        if code == k.STUCK:
+            raise card.not_fetched(int(box[k.FETCHED]) * FRAME_BYTES, int(box[k.TO_START]) * FRAME_BYTES)
         if code == k.FAILED:
             error = self._error()
-            if self._card.running or box[k.IS_FILLING]:
+            if box[k.IS_FILLING] or (card.running and not card.ran_dry):
                 raise error
             if k.look(box) == k.FAILED:
                 raise self._error()

@@ -180,6 +180,11 @@ class SimulatedCard:
             self._machine.buffer = None
             self._is_open = False
 
+    @property
+    def step_time_s(self) -> float:
+        """The time of the step that is being called, else that of the clock."""
+        return self._now()
+
     def _now(self) -> float:
         return self._clock.now() if self._within_step_s is None else self._within_step_s
 

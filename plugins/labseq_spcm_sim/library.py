@@ -329,6 +329,11 @@ class SimulatedLibrary:
         card.call(step)
         return True
 
+    def step_time_s(self) -> float:
+        """The time of the step that is being called, which may be earlier than that of the clock."""
+        card = self.card or _library().cards[self._name]
+        return card.step_time_s
+
     def emergency(self, script: Path) -> Emergency | None:  # noqa: ARG002 - for a real card
         """None: the card is in this process, and dies with it."""
         return None

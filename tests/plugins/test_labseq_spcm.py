@@ -305,9 +305,9 @@ def test_a_card_that_something_else_stops_has_not_played_to_the_end(driver: Any)
 def test_a_slot_that_is_slower_than_the_output_is_an_underrun_also_at_the_end(
     driver: Any,
 ) -> None:
-    slow = replace(M4I6631, bus_bytes_per_s=0.5e9)  # half of what is played
+    slow = replace(M4I6631, bus_bytes_per_s=0.3e9)  # a third of what is played
     with driver("fifo", model=slow, fill=1e-3) as lab:
-        lab.tweezers.prepare(lab.program(6))
+        lab.tweezers.prepare(lab.program(10))
         lab.tweezers.play()
         fifo = lab.card._machine.fifo
         with pytest.raises(TransientError, match=r"underrun: .* \(100% of the program was rendered"):

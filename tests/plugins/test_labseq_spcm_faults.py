@@ -310,9 +310,9 @@ def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
         ("mode: fifo, sample_rate: 1 GHz", 2, "the bus carries at most 700 MHz"),
         ("mode: stream, sample_rate: 1 GHz", 2, "the bus carries at most 700 MHz"),
         ("mode: stream, trigger: external", 2, "no external trigger"),
-        ("mode: stream, look_ahead: 0.1 ms", 2, "look_ahead is 100 us; expected at least 157"),
+        ("mode: stream, look_ahead: 0.1 ms", 2, "look_ahead is 100 us; expected at least 184"),
         ("mode: stream, notify_size: 5000", 2, "notify_size is 5000; expected a power of two"),
-        ("mode: stream, card_buffer: 8192", 2, "at least notify_size, 65536"),
+        ("mode: stream, card_buffer: 65536", 2, "at least twice notify_size, 131072"),
         (f"mode: stream}}{LINE[:-1]}", 2, "a line triggers it, but mode: stream"),
         (
             "keep_warm: {row_frequency: 82 MHz, column_frequency: 118 MHz}",
