@@ -22,6 +22,12 @@ POLL_S: Final = 0.2e-3
 TRANSFER_TIMEOUT_S: Final = 1.0
 """How much longer than at its slowest speed the bus may take, in seconds."""
 
+NOT_LOCKED: Final = (
+    "; connect the clock that reference_clock names (peak to peak 1 to 3 V as a sine, 0.3 to 3 V as a square "
+    "wave), or leave reference_clock out"
+)
+"""What to do where the card's PLL does not lock (levels: manual, technical data, clock)."""
+
 
 class Buffer:
     """Memory from which the card fetches samples; it grows and is kept.
@@ -97,7 +103,8 @@ class AwgCard:
         if code == self.spcm.ERR_TIMEOUT:
             raise DeviceTimeoutError(self.name, f"{action}: the card's driver timed out", 0.0)
         if code:
-            raise DeviceError(self.name, f"{action}: {self.clear_error(code)}")
+            hint = NOT_LOCKED if code == self.spcm.ERR_CLOCKNOTLOCKED else ""
+            raise DeviceError(self.name, f"{action}: {self.clear_error(code)}{hint}")
 
     @property
     def handle(self) -> int:

@@ -6,9 +6,10 @@ analog outputs, clock, generation modes and trigger.
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
-from labseq.plugin import LimitError, format_quantity
+from labseq.plugin import LimitError, SiteGrid, format_quantity
 from labseq.plugin.motion import RfSpec
 
 FAMILY: Final = 0x66
@@ -19,6 +20,10 @@ SAMPLE_RATE_HZ: Final = (50e6, 1.25e9)
 RATE_GAPS_HZ: Final = ((750e6, 757e6), (1125e6, 1145e6))
 """Sample rates that the clock cannot make."""
 RATE_STEP_HZ: Final = 8
+"""Steps of the sample rate with the card's own clock."""
+REFERENCE_TOLERANCE: Final = 1e-3
+"""By how much of itself the rate may differ with an external reference, for which the manual gives no steps
+(ours). The samples are those of the rate that the card reads."""
 REFERENCE_HZ: Final = (10e6, 1.25e9)
 FIFO_RATE_HZ: Final = 700e6
 """2.8 GB/s over PCIe x8 Gen 2 (the vendor's page on generator modes), for two channels of 2 bytes."""
@@ -63,6 +68,28 @@ def full_scale_mv(name: str, rf: RfSpec) -> int:
         most = format_quantity(rf.max_peak_v, "voltage")
         raise LimitError(setting, value, f"rf.max_peak, {most}", "more damages the amplifiers")
     return amplitude_mv
+
+
+def reference_warnings(name: str, rate_hz: float, reference_hz: float | None, grid: SiteGrid) -> list[str]:
+    """The rates to use if a sample rate is no whole multiple of the reference clock, as the manual asks."""
+    if reference_hz is None or rate_hz % reference_hz == 0:
+        return []
+    below = math.floor(rate_hz / reference_hz)
+    near = [n * reference_hz for n in (below, below + 1)]
+    spacings = [
+        abs(float(hz[1] - hz[0])) for hz in (grid.row_frequency_hz, grid.column_frequency_hz) if len(hz) > 1
+    ]
+    most = math.floor(1.1 * rate_hz / reference_hz)
+    multiples = [n * reference_hz for n in range(math.ceil(0.9 * rate_hz / reference_hz), most + 1)]
+    combs = [hz for hz in multiples if all(abs(hz / s - round(hz / s)) < 1e-6 for s in spacings)]
+    best = min(combs or near, key=lambda hz: abs(hz - rate_hz))
+    rate, reference, low, high, good = (
+        format_quantity(hz, "frequency") for hz in (rate_hz, reference_hz, *near, best)
+    )
+    what = f"profile.{name}.sample_rate is {rate}, not a whole multiple of reference_clock, {reference}"
+    why = "the PLL may be unable to make it, and its phase may differ from start to start"
+    renders = ", which also has a whole number of samples per tone spacing" if combs else ""
+    return [f"{what}: {why}; the nearest multiples are {low} and {high}; set sample_rate: {good}{renders}"]
 
 
 def check_sample_rate(name: str, sample_rate_hz: float, rf: RfSpec) -> None:

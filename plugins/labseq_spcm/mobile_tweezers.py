@@ -43,7 +43,7 @@ from labseq_spcm.stream import Stream, check_rendering
 
 RAMP_STEPS: Final = 15
 HOT_C: Final = 80
-"""Highest temperature that passes the self test, in degrees Celsius (our choice)."""
+"""Highest temperature of both sensors, in degrees Celsius (manual, "Temperature sensors")."""
 TEST_SAMPLES: Final = 1 << 16
 """Samples of both outputs, all 0, that the self test sends to the card's memory."""
 
@@ -127,7 +127,12 @@ class SpcmMobileTweezers(MobileTweezers):
         return math.inf if self._mode is None else self._mode.beginning_s
 
     def warnings(self) -> list[str]:
-        """The sample rate of a stream, if another one is rendered several times faster."""
+        """A rate that does not suit the reference clock; a stream's, if another is rendered much faster."""
+        settings, grid = self._settings, self._context.grid
+        found = limits.reference_warnings(self._name, settings.sample_rate, settings.reference_clock, grid)
+        return found + self._rendering_warnings()
+
+    def _rendering_warnings(self) -> list[str]:
         if self._settings.mode != "stream":
             return []
         rate_hz = self._settings.sample_rate
@@ -385,7 +390,7 @@ class SpcmMobileTweezers(MobileTweezers):
         if card.read(spcm.SPCM_FW_CTRL_ACTIVE) >> 28 == 2:
             text = "the card runs its recovery firmware; restart the computer, else update the firmware"
             raise DeviceError(self._name, f"{text} with Spectrum's Control Center")
-        sensors = (("base card", spcm.SPC_MON_TC_BASE_CTRL), ("output module", spcm.SPC_MON_TC_MODULE_0))
+        sensors = (("base card", spcm.SPC_MON_TC_BASE_CTRL), ("amplifier", spcm.SPC_MON_TC_MODULE_1))
         for place, register in sensors:
             temperature_c = card.read(register)
             if temperature_c > HOT_C:

@@ -72,15 +72,21 @@ def _version(card: AwgCard, register: int) -> str:
 
 
 def _set_clock(card: AwgCard, settings: SpcmSettings) -> float:
-    """Set the sample clock; returns the rate that it really makes, in Hz."""
+    """Set the sample clock; returns the rate that it really makes, in Hz.
+
+    It is written to the card here, with the outputs off, because the PLL may take 0.2 s to lock.
+    """
     spcm, reference_hz = card.spcm, settings.reference_clock
+    rate_hz, tolerance_hz = round(settings.sample_rate), limits.RATE_STEP_HZ
     if reference_hz is None:
         card.set(spcm.SPC_CLOCKMODE, spcm.SPC_CM_INTPLL, "clock mode")
     else:
         card.set(spcm.SPC_CLOCKMODE, spcm.SPC_CM_EXTREFCLOCK, "clock mode")
         card.set(spcm.SPC_REFERENCECLOCK, round(reference_hz), "reference clock in Hz")
-    rate_hz = round(settings.sample_rate)
-    return float(card.set(spcm.SPC_SAMPLERATE, rate_hz, "sample rate in Hz", limits.RATE_STEP_HZ))
+        tolerance_hz = round(limits.REFERENCE_TOLERANCE * rate_hz)
+    actual_hz = card.set(spcm.SPC_SAMPLERATE, rate_hz, "sample rate in Hz", tolerance_hz)
+    card.write_setup()
+    return float(actual_hz)
 
 
 def _set_outputs(card: AwgCard, amplitude_mv: int) -> None:

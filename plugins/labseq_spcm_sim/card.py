@@ -5,13 +5,14 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Clock
+from labseq.plugin import Clock, StopRequested
 from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.machine import Machine
 from labseq_spcm_sim.modes import Buffer
@@ -234,6 +235,14 @@ class SimulatedCard:
 
     def write_all(self, writes: Iterable[tuple[int, Number]]) -> int:
         """Write registers one after the other, up to the first that is refused."""
+        code = self._write_all(writes)
+        busy_s, self._machine.busy_s = self._machine.busy_s, 0.0
+        if busy_s:
+            with suppress(StopRequested):  # nothing may pass through C; the caller's next wait raises it
+                self._clock.sleep(busy_s)
+        return code
+
+    def _write_all(self, writes: Iterable[tuple[int, Number]]) -> int:
         with self._lock:
             if self._error.code:
                 return r.ERR_LASTERR

@@ -35,7 +35,10 @@ class CardModel:
         relay_s: How long the output is off when the path changes.
         output_relay_s: How long an output is off after its relay was closed (ours, as the path's relay).
         bus_bytes_per_s: Transfer from the PC; PCIe x8 Gen 2.
-        temperature_c: What its sensors read, in degrees Celsius (ours).
+        temperature_c: What the sensor of the base card reads, in degrees Celsius (ours).
+        amplifier_c: The same of the amplifiers.
+        reference_hz: The signal at the clock input; 0: none.
+        reference_divider: The PLL divides it by this, and multiplies the result by whole numbers (ours).
         firmware_type: 1 for its own, 2 for the recovery firmware.
     """
 
@@ -51,6 +54,9 @@ class CardModel:
     output_relay_s: float = 10e-3
     bus_bytes_per_s: float = 2.8e9
     temperature_c: int = 45
+    amplifier_c: int = 50
+    reference_hz: float = 10e6
+    reference_divider: int = 16
     firmware_type: int = 1
 
 
@@ -60,6 +66,8 @@ FIRMWARE: Final = 1
 """Version of the main control's firmware (ours)."""
 OUTPUT_FIFO_BYTES: Final = 192 * 1024
 """Of the FIFO between the on-board memory and the outputs (manual, "Output latency")."""
+PLL_LOCK_S: Final = 200e-3
+"""The longest time in which the PLL locks (manual, "PLL Locking Error")."""
 MEMORY_STEP: Final = 32
 """Step and minimum of the memory size, in samples per channel."""
 MAX_LOOPS: Final = 2**32 - 1
@@ -114,6 +122,7 @@ class Setup:
     def __init__(self, model: CardModel) -> None:
         self.model = model
         self._values: dict[int, Number] = {**_DEFAULTS, **_fixed(model)}
+        self._locked: list[int] = []
         self.write_to_card()
 
     def __contains__(self, register: int) -> bool:
@@ -122,9 +131,22 @@ class Setup:
     def __getitem__(self, register: int) -> int:
         return int(self._values[register])
 
-    def write_to_card(self) -> None:
-        """Send all values to the card, as WRITESETUP and the start do; before, only the driver has them."""
+    def write_to_card(self) -> bool:
+        """Send all values to the card, as WRITESETUP and the start do; before, only the driver has them.
+
+        Returns:
+            Whether the PLL had to lock on an external reference that has changed.
+
+        Raises:
+            Refusal: It cannot, as that reference is not there, or has another frequency.
+        """
+        clock = [self[register] for register in (r.SPC_CLOCKMODE, r.SPC_REFERENCECLOCK, r.SPC_SAMPLERATE)]
+        is_external = clock[0] == r.SPC_CM_EXTREFCLOCK
+        if is_external and abs(clock[1] - self.model.reference_hz) > 1e-4 * clock[1]:
+            raise Refusal(r.ERR_CLOCKNOTLOCKED, "the clock is not locked")
+        has_changed, self._locked = is_external and clock != self._locked, clock
         self._on_card = dict(self._values)
+        return has_changed
 
     def on_card(self, register: int) -> int:
         """The value that the card works with."""
@@ -222,6 +244,9 @@ def _sample_rate(setup: Setup, value: Number) -> Number:
     for start, end in model.rate_gaps_hz:
         if start < value < end:
             raise refuse(value, f"a rate outside of the clock's gap from {start:g} to {end:g} S/s")
+    if setup[r.SPC_CLOCKMODE] == r.SPC_CM_EXTREFCLOCK:
+        step_hz = setup[r.SPC_REFERENCECLOCK] / model.reference_divider
+        return round(stepped(value, *model.sample_rate_hz, step_hz))
     return stepped(value, *model.sample_rate_hz, model.rate_step_hz)
 
 
@@ -297,7 +322,8 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_READAOGAINMIN: model.amplitude_mv[0],
         r.SPC_READAOGAINMAX: model.amplitude_mv[1],
         r.SPC_MON_TC_BASE_CTRL: model.temperature_c,
-        r.SPC_MON_TC_MODULE_0: model.temperature_c,
+        r.SPC_MON_TC_MODULE_0: 0,  # not used (manual, temperature sensors)
+        r.SPC_MON_TC_MODULE_1: model.amplifier_c,
         r.SPCM_FW_CTRL: 1 << 16 | FIRMWARE,
         r.SPCM_FW_CTRL_ACTIVE: model.firmware_type << 28 | FIRMWARE << 16,
         r.SPC_AVAILCARDMODES: sum(_MODES),

@@ -349,13 +349,17 @@ def test_a_card_that_is_well_passes_and_stays_silent(driver: Any, mode: str) -> 
         lab.play(lab.program(1))
 
 
-@pytest.mark.parametrize(("above_c", "well"), [(0, True), (1, False)])
-def test_a_hot_card_is_reported(driver: Any, above_c: int, well: bool) -> None:
-    with driver(model=replace(M4I6631, temperature_c=HOT_C + above_c)) as lab:
-        if well:
+@pytest.mark.parametrize(
+    ("place", "text"), [("temperature_c", "base card"), ("amplifier_c", "amplifier"), ("", "")]
+)
+def test_a_hot_card_is_reported(driver: Any, place: str, text: str) -> None:
+    hottest = {"temperature_c": HOT_C, "amplifier_c": HOT_C}
+    model = replace(M4I6631, **(hottest | ({place: HOT_C + 1} if place else {})))
+    with driver(model=model) as lab:
+        if not place:
             lab.tweezers.self_test()
             return
-        with pytest.raises(DeviceError, match="81 degrees Celsius; expected at most 80"):
+        with pytest.raises(DeviceError, match=f"{text} has 81 degrees Celsius; expected at most 80"):
             lab.tweezers.self_test()
 
 

@@ -1,17 +1,21 @@
-"""The Spectrum driver against the cards' manual: start of a stream, underrun, errors."""
+"""The Spectrum driver against the cards' manual: start of a stream, underrun, errors, reference clock."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
+from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import M4I6631, registers as r
 from labseq_spcm_sim.card import SimulatedCard
 from labseq_spcm_sim.machine import Machine
 from labseq_spcm_sim.modes import Fifo
 
-from labseq.plugin import DeviceError, DeviceTimeoutError, TransientError
+from labseq.motion.rendering import render
+from labseq.plugin import Context, DeviceError, DeviceTimeoutError, TransientError
 
 STREAMED = ["fifo", "stream"]
 
@@ -105,3 +109,64 @@ def test_an_error_for_which_the_library_has_no_text_is_named(
         lab.clock.sleep(10e-3)
         with pytest.raises(DeviceError, match=r": ERR_(LASTERR|INTERNAL_ERROR) \(0x[0-9a-f]+\)$"):
             lab.tweezers.prepare(lab.program(1))
+
+
+class TestReferenceClock:
+    """Manual p. 115."""
+
+    def test_the_rate_that_the_pll_makes_is_the_one_that_is_rendered(self, driver: Any) -> None:
+        with driver(sample_rate=249.9e6, reference_clock=10e6) as lab:
+            assert lab.rate_hz == 250e6
+            program = lab.program(1)
+            lab.play(program)
+            rendered = render(program, 250e6).samples[0]
+            assert np.array_equal(lab.samples(0)[: len(rendered)], rendered)
+
+    def test_a_rate_that_the_pll_misses_by_far_is_refused(self, driver: Any) -> None:
+        coarse = replace(M4I6631, reference_divider=1)
+        with (
+            pytest.raises(DeviceError, match="sample rate in Hz was set to 624000000, and the card reads 62"),
+            driver(model=coarse, sample_rate=624e6, reference_clock=10e6),
+        ):
+            pass
+
+    @pytest.mark.parametrize("signal_hz", [0.0, 100e6])
+    def test_a_clock_that_is_not_there_is_reported_when_the_card_is_opened(
+        self, driver: Any, signal_hz: float
+    ) -> None:
+        model = replace(M4I6631, reference_hz=signal_hz)
+        with (
+            pytest.raises(
+                DeviceError, match="the clock is not locked; connect the clock that reference_clock"
+            ),
+            driver(model=model, reference_clock=10e6),
+        ):
+            pass
+
+    def test_the_pll_locks_when_the_card_is_opened_and_not_in_a_shot(self, driver: Any) -> None:
+        with driver(reference_clock=10e6) as lab:
+            assert lab.clock.now() >= 0.2
+            start_s = lab.clock.now()
+            lab.play(lab.program(1))
+            assert lab.clock.now() - start_s < 0.1
+
+    @pytest.mark.parametrize(
+        ("rate_hz", "reference_hz", "text"),
+        [
+            (
+                624e6,
+                10e6,
+                "the nearest multiples are 620 MHz and 630 MHz; set sample_rate: 640 MHz, which also",
+            ),
+            (625e6, 10e6, "set sample_rate: 640 MHz"),
+            (624e6, 100e6, "the nearest multiples are 600 MHz and 700 MHz; set sample_rate: 600 MHz"),
+            (640e6, 10e6, ""),
+            (624e6, None, ""),
+        ],
+    )
+    def test_check_names_the_nearest_whole_multiples(
+        self, rate_hz: float, reference_hz: float | None, text: str
+    ) -> None:
+        settings = SpcmSettings(card="simulated", sample_rate=rate_hz, reference_clock=reference_hz)
+        warnings = SpcmMobileTweezers(settings, Context("awg")).warnings()
+        assert [text in warning for warning in warnings] == [True] * bool(text)
