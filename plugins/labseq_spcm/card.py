@@ -57,6 +57,8 @@ class AwgCard:
     Attributes:
         spcm: The vendor's package.
         library: Where the card comes from.
+        n_outputs: How many outputs the card has.
+        outputs: Those that are used, in ascending order.
 
     Raises:
         DeviceError: No package or driver library, no such card, or another program holds it. Every method
@@ -68,7 +70,11 @@ class AwgCard:
         self.clock = clock
         self.spcm = spcm = load_spcm(name, library)
         self.library = library
+        self.n_outputs = 2
+        self.outputs: tuple[int, ...] = (0, 1)
         device_name = library.connect()
+        # every slot for the card reaches 0.5 GB/s; a NETBOX has Gigabit Ethernet
+        self._slowest_bytes_per_s = 50e6 if device_name.upper().startswith("TCPIP") else 0.5e9
         self._handle: Any = spcm.spcm_hOpen(ctypes.create_string_buffer(device_name.encode()))
         if not self._handle:
             reason = self.clear_error()
@@ -224,7 +230,7 @@ class AwgCard:
         """
         self.define_transfer(frames)
         self.command(self.spcm.M2CMD_DATA_STARTDMA, "upload")
-        limit_s = frames.nbytes / 0.5e9 + TRANSFER_TIMEOUT_S  # every slot for the card reaches 0.5 GB/s
+        limit_s = frames.nbytes / self._slowest_bytes_per_s + TRANSFER_TIMEOUT_S
         deadline_s = self.clock.now() + limit_s
         while not self.status & self.spcm.M2STAT_DATA_END:
             if self.clock.now() > deadline_s:

@@ -73,9 +73,9 @@ class VendorLibrary:
         """The time of the step that is being called: there are none."""
         return 0.0
 
-    def emergency(self, script: Path) -> Emergency | None:
+    def emergency(self, script: Path, n_outputs: int) -> Emergency | None:
         """The driver's script that switches the card off from another process, with the vendor's library."""
-        return Emergency(script, {"library": LIBRARY, "card": self._device_name})
+        return Emergency(script, {"library": LIBRARY, "card": self._device_name, "n_outputs": n_outputs})
 
 
 Library: TypeAlias = "VendorLibrary | SimulatedLibrary"
@@ -93,7 +93,9 @@ def choose_library(name: str, settings: SpcmSettings, context: Context) -> Libra
         from labseq_spcm_sim import SimulatedLibrary
     except ModuleNotFoundError as error:
         raise _not_installed(name, error) from error
-    return SimulatedLibrary(settings.card, context.clock, context.simulation, settings.row_channel)
+    return SimulatedLibrary(
+        settings.card, context.clock, context.simulation, *settings.outputs, model=settings.model
+    )
 
 
 def load_spcm(name: str, library: Library) -> Any:

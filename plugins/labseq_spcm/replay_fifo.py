@@ -66,7 +66,7 @@ class Replay(PlayMode):
 
     def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
         super().__init__(card)
-        self._row_channel, self._rate_hz = settings.row_channel, sample_rate_hz
+        self._row_channel, self._rate_hz = settings.row_index, sample_rate_hz
         self._buffer = Buffer()
         spcm = card.spcm
         card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
@@ -112,7 +112,7 @@ class Fifo(PlayMode):
 
     def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
         super().__init__(card)
-        self._row_channel, self._rate_hz = settings.row_channel, sample_rate_hz
+        self._row_channel, self._rate_hz = settings.row_index, sample_rate_hz
         self._ring = Buffer().reserve(RING_CHUNKS * CHUNK)
         self._half_ring_s = RING_CHUNKS / 2 * CHUNK / sample_rate_hz
         self._renderer: InterleavedRenderer | None = None

@@ -151,7 +151,7 @@ class Stream(PlayMode):
     ) -> None:
         super().__init__(card)
         self._rate_hz = sample_rate_hz
-        self._row_channel = settings.row_channel
+        self._row_channel = settings.row_index
         self._block = block = settings.notify_size // FRAME_BYTES
         self._on_card = (settings.card_buffer + OUTPUT_FIFO_BYTES) // FRAME_BYTES
         # a block less than the whole: the card may keep some bytes for itself, and reports whole blocks
@@ -164,7 +164,7 @@ class Stream(PlayMode):
         self._ring = Buffer().reserve(n_samples)
         self._silence = np.zeros((block, 2), np.int16)
         if keep_warm is not None:
-            self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_channel, block)
+            self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_index, block)
         self._ring.reshape(-1, block, 2)[:] = self._silence
         # for what is rendered between `prepare` and `start`: at most 0.8 ms at 625 MS/s
         self._ready = [Buffer().reserve(1 << 19) for _ in range(3)]

@@ -161,10 +161,10 @@ class SimulatedCard:
             return self._machine.running
 
     @property
-    def outputs_on(self) -> tuple[bool, bool]:
-        """Whether the output relays of the two channels are closed."""
+    def outputs_on(self) -> tuple[bool, ...]:
+        """Whether the output relay of each channel is closed."""
         with self._lock:
-            return self._machine.amplifiers[0].enabled, self._machine.amplifiers[1].enabled
+            return tuple(amplifier.enabled for amplifier in self._machine.amplifiers)
 
     # Functions of the driver library; most return the vendor's error code
 

@@ -30,7 +30,7 @@ from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.card import DRIVER_VERSION, SimulatedCard
 from labseq_spcm_sim.modes import Buffer
 from labseq_spcm_sim.output import FULL_SCALE, SampleSpan
-from labseq_spcm_sim.setup import ErrorInfo, Number
+from labseq_spcm_sim.setup import M4I6631, MODELS, ErrorInfo, Number
 
 Slot = ctypes.c_int32 | ctypes.c_uint32 | ctypes.c_int64 | ctypes.c_double
 
@@ -266,14 +266,26 @@ class SimulatedLibrary:
             :func:`install` made available.
         clock: The session's time.
         simulation: Receives what the card plays, if it implements ``ReceivesOutput``.
-        row_channel: Channel that drives the row axis; the other drives the columns.
+        row_channel: Channel that drives the row axis.
+        column_channel: Channel that drives the columns; None: the other one of 0 and 1.
+        model: What card a new one is, of ``MODELS``; "": an M4i.6631-x8.
 
     Attributes:
         card: The new card in this process, while connected.
     """
 
-    def __init__(self, name: str, clock: Clock, simulation: Simulation | None, row_channel: int) -> None:
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        simulation: Simulation | None,
+        row_channel: int,
+        column_channel: int | None = None,
+        model: str = "",
+    ) -> None:
         self._name = name
+        self._model = model
+        self._column_channel = column_channel
         self._clock = clock
         self._simulation = simulation
         self._row_channel = row_channel
@@ -295,7 +307,11 @@ class SimulatedLibrary:
         if self._name != PREFIX:
             return self._name
         received = isinstance(self._simulation, ReceivesOutput)
-        self.card = card = SimulatedCard(self._clock, keep_history=received)
+        if self._model and self._model not in MODELS:
+            text = f"there is no simulated {self._model}; expected one of {', '.join(MODELS)}"
+            raise DeviceError("spcm simulator", f"{text}, or no `model`")
+        model = MODELS.get(self._model, M4I6631)
+        self.card = card = SimulatedCard(self._clock, model=model, keep_history=received)
         self.wire(card)
         return install(card)
 
@@ -304,7 +320,8 @@ class SimulatedLibrary:
         if self._simulation is not None:
             self._simulation.wire("mobile_tweezers", lambda t_s, _width_s: card.trigger_at(t_s))
         if isinstance(self._simulation, ReceivesOutput):
-            self._simulation.connect_outputs("mobile_tweezers", CardOutputs(card, self._row_channel))
+            outputs = CardOutputs(card, self._row_channel, self._column_channel)
+            self._simulation.connect_outputs("mobile_tweezers", outputs)
 
     def disconnect(self) -> None:
         """Remove the card."""
@@ -334,7 +351,7 @@ class SimulatedLibrary:
         card = self.card or _library().cards[self._name]
         return card.step_time_s
 
-    def emergency(self, script: Path) -> Emergency | None:  # noqa: ARG002 - for a real card
+    def emergency(self, script: Path, n_outputs: int) -> Emergency | None:  # noqa: ARG002 - for a real card
         """None: the card is in this process, and dies with it."""
         return None
 
@@ -346,12 +363,13 @@ class CardOutputs:
 
     Args:
         card: The card.
-        row_channel: Channel that drives the row axis; the other drives the columns.
+        row_channel: Channel that drives the row axis.
+        column_channel: Channel that drives the columns; None: the other one of 0 and 1.
     """
 
-    def __init__(self, card: SimulatedCard, row_channel: int) -> None:
+    def __init__(self, card: SimulatedCard, row_channel: int, column_channel: int | None = None) -> None:
         self._card = card
-        self._channels = row_channel, 1 - row_channel
+        self._channels = row_channel, 1 - row_channel if column_channel is None else column_channel
         self._reported_s = -math.inf
 
     def played(self, until_s: float) -> tuple[list[RfSpan], list[RfSpan]]:

@@ -10,6 +10,8 @@ from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.modes import Buffer, Fifo, Memory, Replay, Run, Stretch
 from labseq_spcm_sim.output import Amplifier, SampleSpan
 from labseq_spcm_sim.setup import (
+    AMPLITUDES,
+    OUTPUTS,
     PLL_LOCK_S,
     UNKNOWN,
     CardModel,
@@ -20,8 +22,6 @@ from labseq_spcm_sim.setup import (
     trigger_delay_s,
 )
 
-AMPLITUDES: Final = {r.SPC_AMP0: 0, r.SPC_AMP1: 1}
-OUTPUTS: Final = {r.SPC_ENABLEOUT0: 0, r.SPC_ENABLEOUT1: 1}
 WAITS: Final = r.M2CMD_CARD_WAITTRIGGER | r.M2CMD_CARD_WAITREADY | r.M2CMD_DATA_WAITDMA
 
 
@@ -56,7 +56,7 @@ class Machine:
     def __init__(self, model: CardModel, *, keeps_streams: bool) -> None:
         self.model = model
         self._keeps_streams = keeps_streams
-        self.amplifiers = (Amplifier(model), Amplifier(model))
+        self.amplifiers = tuple(Amplifier(model) for _ in range(model.n_channels))
         self.samples: list[Record] = []
         self._power_on()
 
@@ -187,7 +187,8 @@ class Machine:
         if self.setup.write_to_card():
             self.busy_s = PLL_LOCK_S
         for register, channel in OUTPUTS.items():
-            self.amplifiers[channel].enable(bool(self.setup[register]), now_s)
+            if channel < self.model.n_channels:
+                self.amplifiers[channel].enable(bool(self.setup[register]), now_s)
 
     def _reset(self, now_s: float) -> None:
         """Everything as after power-on, outputs off."""
