@@ -222,20 +222,25 @@ class AwgCard:
         hint = "use mode: replay, and see the card's bus in Spectrum's Control Center"
         return DeviceTimeoutError(self.name, f"{text}; {hint}", TRANSFER_TIMEOUT_S)
 
-    def upload(self, frames: NDArray[np.int16], poll_s: float = POLL_S) -> None:
+    def upload(self, frames: NDArray[np.int16], poll_s: float = POLL_S) -> float:
         """Transfer samples to the on-board memory, and wait until they have arrived.
+
+        Returns:
+            How long that took, in seconds, without the naming of the buffer, which pins its pages.
 
         Raises:
             DeviceTimeoutError: They take too long.
         """
         self.define_transfer(frames)
+        start_s = self.clock.now()
         self.command(self.spcm.M2CMD_DATA_STARTDMA, "upload")
         limit_s = frames.nbytes / self._slowest_bytes_per_s + TRANSFER_TIMEOUT_S
-        deadline_s = self.clock.now() + limit_s
+        deadline_s = start_s + limit_s
         while not self.status & self.spcm.M2STAT_DATA_END:
             if self.clock.now() > deadline_s:
                 raise DeviceTimeoutError(self.name, f"{frames.nbytes} bytes were not uploaded", limit_s)
             self.clock.sleep(poll_s)
+        return self.clock.now() - start_s
 
     def stop(self) -> None:
         """Stop playing and transferring; no effect if it does neither."""

@@ -195,7 +195,7 @@ class SpcmMobileTweezers(MobileTweezers):
             if not self._clock.virtual:  # virtual time waits for the rendering
                 check_rendering(self._name, self._context, rate_hz, self._settings.row_index)
             stream = Stream(card, self._settings, rate_hz, self._keep_warm)
-            self._facts["trigger_delay_s"] = stream.delay_s
+            self._facts |= {"trigger_delay_s": stream.delay_s, "bus_bytes_per_s": stream.bus_bytes_per_s}
             return stream
         mode = Replay if self._settings.mode == "replay" else Fifo
         return mode(card, self._settings, rate_hz)

@@ -35,7 +35,10 @@ BEGINNING_S: Final = 1e-3
 """A program is cut after that time: making the rest takes less, even if the computer is busy."""
 TRIES: Final = 5
 BUS_SAMPLES: Final = 1 << 22
-"""Samples that are sent to measure the speed of the bus: 6 ms at 2.8 GB/s."""
+"""Most samples that are sent to measure the speed of the bus: 6 ms at 2.8 GB/s."""
+PCIE_BYTES_PER_S: Final = {1: 0.175e9, 2: 0.35e9, 3: 0.69e9}
+"""What a lane of a generation carries to the card: 70 % of its bits, as in the manual's 2.8 GB/s over eight
+lanes of generation 2 (with payloads of 256 bytes); later ones at least as much as the third."""
 
 
 def check_rendering(name: str, context: Context, sample_rate_hz: float, row_channel: int) -> None:
@@ -138,6 +141,7 @@ class Stream(PlayMode):
     Attributes:
         n_underruns: How often the card ran dry in silence, and was started again.
         delay_s: From ``start`` to the first sample at the output, at most.
+        bus_bytes_per_s: What the bus carries, as measured.
 
     Raises:
         DeviceError: The bus is too slow for the sample rate.
@@ -181,7 +185,7 @@ class Stream(PlayMode):
         self._alive = deque[Program](maxlen=2 * k.N_QUEUE)  # the loop may still use earlier ones
         self._box = self._new_box()
         self.n_underruns = self._n_pauses = 0
-        self._check_bus()
+        self.bus_bytes_per_s = self._check_bus()
         self._set_mode(settings)
 
     def _new_box(self) -> NDArray[np.int64]:
@@ -198,22 +202,34 @@ class Stream(PlayMode):
         box[k.START_COMMAND] = start
         return box
 
-    def _check_bus(self) -> None:
-        """Time transfers to the card's memory; the fastest counts."""
-        card, spcm, frames = self._card, self._card.spcm, Buffer().reserve(BUS_SAMPLES)
+    def _check_bus(self) -> float:
+        """Check that the bus carries the stream; returns its speed in bytes per second.
+
+        First what the slot is, as the card reads it, then transfers of two sizes to its memory: from one to
+        the other nothing counts but the samples. Of each size the fastest counts.
+
+        Raises:
+            DeviceError: It is too slow.
+        """
+        card, spcm, needed = self._card, self._card.spcm, FRAME_BYTES * self._rate_hz
+        generation, lanes = card.read(spcm.SPC_PCIEXPGENERATION), card.read(spcm.SPC_PCIEXPLANES)
+        slot = lanes * PCIE_BYTES_PER_S.get(generation, PCIE_BYTES_PER_S[3])
+        if slot < needed:
+            raise self._too_slow(f"the slot has {lanes} lanes of PCIe generation {generation}: it", slot)
+        frames, sizes = Buffer().reserve(BUS_SAMPLES), (BUS_SAMPLES // 4, BUS_SAMPLES)
         card.set(spcm.SPC_MEMSIZE, BUS_SAMPLES, "memory size")
-        took_s, needed = math.inf, FRAME_BYTES * self._rate_hz
-        for _ in range(2 * TRIES):
-            start_s = card.clock.now()
-            card.upload(frames, poll_s=20e-6)
-            took_s = min(took_s, card.clock.now() - start_s)
-            if took_s <= frames.nbytes / needed:
-                return
-        speed, most_hz = frames.nbytes / took_s, frames.nbytes / took_s / FRAME_BYTES
-        rate, most = (format_quantity(hz, "frequency") for hz in (self._rate_hz, most_hz))
-        text = f"the bus carries {speed / 1e9:.3g} GB/s, but mode: stream at {rate} needs"
+        took_s = [min(card.upload(frames[:n], poll_s=20e-6) for _ in range(TRIES)) for n in sizes]
+        speed = FRAME_BYTES * (sizes[1] - sizes[0]) / max(took_s[1] - took_s[0], 1e-9)
+        if speed < needed:
+            raise self._too_slow("the bus", speed)
+        return speed
+
+    def _too_slow(self, what: str, bytes_per_s: float) -> DeviceError:
+        rate, most = (format_quantity(hz, "frequency") for hz in (self._rate_hz, bytes_per_s / FRAME_BYTES))
+        needed = FRAME_BYTES * self._rate_hz
+        text = f"{what} carries {bytes_per_s / 1e9:.3g} GB/s, but mode: stream at {rate} needs"
         hint = f"use a slot with more lanes, a sample_rate below {most}, or mode: replay"
-        raise DeviceError(card.name, f"{text} {needed / 1e9:.3g} GB/s; {hint}")
+        return DeviceError(self._card.name, f"{text} {needed / 1e9:.3g} GB/s; {hint}")
 
     def _set_mode(self, settings: SpcmSettings) -> None:
         card, spcm = self._card, self._card.spcm

@@ -36,7 +36,8 @@ class CardModel:
             low path is left, below the first the high one.
         relay_s: How long the output is off when the path changes.
         output_relay_s: How long an output is off after its relay was closed (ours, as the path's relay).
-        bus_bytes_per_s: Transfer from the PC; PCIe x8 Gen 2.
+        bus_bytes_per_s: Transfer from the PC.
+        pcie: Generation and lanes of its slot.
         temperature_c: What the sensor of the base card reads, in degrees Celsius (ours).
         amplifier_c: The same of the amplifiers.
         reference_hz: The signal at the clock input; 0: none.
@@ -57,6 +58,7 @@ class CardModel:
     relay_s: float = 10e-3
     output_relay_s: float = 10e-3
     bus_bytes_per_s: float = 2.8e9
+    pcie: tuple[int, int] = (2, 8)
     temperature_c: int = 45
     amplifier_c: int = 50
     reference_hz: float = 10e6
@@ -343,6 +345,8 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_SAMPLERATE: int(model.sample_rate_hz[1]),
         r.SPC_PCITYP: model.card_type,
         r.SPC_FNCTYPE: r.SPCM_TYPE_AO,
+        r.SPC_PCIEXPGENERATION: model.pcie[0],
+        r.SPC_PCIEXPLANES: model.pcie[1],
         r.SPC_PCIMEMSIZE: 2 * model.memory_samples,
         r.SPC_PCIFEATURES: 0,
         r.SPC_PCIEXTFEATURES: r.SPCM_FEAT_EXTFW_AWG,

@@ -261,6 +261,39 @@ def test_nothing_is_appended_where_nothing_plays_or_a_program_must_be_whole(driv
             lab.tweezers.append(lab.program(2))
 
 
+@pytest.mark.parametrize(
+    ("pcie", "text"), [((2, 4), "4 lanes of PCIe generation 2"), ((1, 8), "generation 1")]
+)
+def test_a_slot_that_cannot_stream_is_named(driver: Any, pcie: tuple[int, int], text: str) -> None:
+    slot = replace(M4I6631, pcie=pcie)
+    with (
+        pytest.raises(DeviceError, match=rf"the slot has .*{text}: it carries 1\.4 GB/s, .* 2\.5 GB/s"),
+        driver("stream", model=slot, sample_rate=624e6),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("slow_call", ["define_transfer", "write"])
+def test_what_a_transfer_takes_whatever_its_size_is_not_taken_for_a_slow_bus(
+    driver: Any, slow_call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pinning of the buffer's pages, and the start of each transfer."""
+    call = getattr(SimulatedCard, slow_call)
+
+    def slow(card: SimulatedCard, *arguments: Any) -> Any:
+        if slow_call == "define_transfer" or arguments == (
+            registers.SPC_M2CMD,
+            registers.M2CMD_DATA_STARTDMA,
+        ):
+            card._clock.sleep(3e-3)
+        return call(card, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SimulatedCard, slow_call, slow)
+        with driver("stream", sample_rate=624e6) as lab:
+            assert lab.tweezers.describe()["bus_bytes_per_s"] == pytest.approx(2.8e9, rel=0.01)
+
+
 def test_a_bus_that_cannot_stream_is_reported_when_the_card_is_opened(driver: Any) -> None:
     slow = replace(M4I6631, bus_bytes_per_s=1.4e9)  # four lanes
     text = r"1\.4 GB/s, .* 624 MHz needs 2\.5 GB/s; .* below 350 MHz"
