@@ -176,6 +176,7 @@ class Stream(PlayMode):
             frames[:] = 0  # so that the memory is there
         self._scratch = new_scratch()
         self._workspaces: dict[tuple[int, int], Any] = {}
+        self._timer = new_timer()
         self._lock = threading.RLock()
         self._stop = threading.Event()
         self._signals: tuple[WakeSignal, ...] = ()  # of the loop, and of its helper
@@ -250,6 +251,7 @@ class Stream(PlayMode):
             self._is_on, self._stop = True, threading.Event()
         self._has_thread = not self._card.library.call_in_virtual_time(self._virtual_step)
         if self._has_thread:
+            self._box[k.LOCK], self._box[k.TIMER] = self._card.lock.word.ctypes.data, self._timer.ctypes.data
             threads = [("spcm stream", self._run)] + [("spcm helper", self._help)] * (n_cores() > 1)
             self._signals = tuple(WakeSignal() for _ in threads)
             for (name, target), signal in zip(threads, self._signals, strict=True):
@@ -359,7 +361,7 @@ class Stream(PlayMode):
     ) -> None:
         """The thread that supplies the card."""
         raise_priority(above=2)  # so that the card does not run dry because other threads are busy
-        timer, rate_hz, code = new_timer(), int(self._rate_hz), 0
+        timer, rate_hz, code = self._timer, int(self._rate_hz), 0
         while (pause_s := self._step(box, code)) is not None:
             if pause_s:
                 stop.wait(pause_s)

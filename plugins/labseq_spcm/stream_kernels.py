@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from labseq.plugin import const, helper_kernel, kernel
 from labseq.plugin.native import (
     N_SIGNAL,
+    N_TIMER,
     call_c,
     carray,
     now_ns,
@@ -26,7 +27,7 @@ from labseq.plugin.native import (
     swap,
     wait_signal,
 )
-from labseq_spcm.kernels import interleave
+from labseq_spcm.kernels import give, interleave, take
 from labseq_spcm.limits import FRAME_BYTES
 
 Words = NDArray[np.int64]
@@ -62,10 +63,12 @@ and how much the card fetched meanwhile."""
 (HELPER, POSTED, DONE, HELP_AXIS, HELP_START, HELP_OUT) = range(35, 41)
 """Address of the signal for :func:`assist` in another thread, 0 if there is none; a part of the column axis
 that waits to be rendered and one that was, and which: the arguments of RENDER."""
+(LOCK, TIMER) = range(46, 48)
+"""Addresses of the lock of the library's calls, 0 where a call is what calls the loop; and of its timer."""
 (IS_FILLING, TO_START, START_COMMAND, NOW_NS, FILLED_BY_NS) = range(41, 46)
 """Whether the card is filled before its start, the samples that it must have fetched then, the M2CMD, the
 time of this step, and when the filling must be over."""
-N_WORDS: Final = 46
+N_WORDS: Final = 48
 
 LENGTH, ROW_CHANNEL, CUTS, N_CUTS, READY_MADE, ROOM, AXES, N_AXIS, BASE, N_READY, BEGAN = range(11)
 """Words of a program: samples in whole blocks, output of the row axis, address and number of the samples
@@ -126,18 +129,28 @@ def find_cuts(
     return n
 
 
+@helper_kernel("int64(int64[::1], int64, int64, int64)")
+def call_library(box: Words, function: int, register: int, value: int) -> int:
+    """Call one of the library's functions when nobody else does; returns its error code."""
+    if box[LOCK]:
+        take(box[LOCK], carray(pointer(box[TIMER]), N_TIMER, np.int64))
+    box[ERROR] = call_c(function, box[HANDLE], register, value)
+    if box[LOCK]:
+        give(box[LOCK])
+    return box[ERROR]  # pyright: ignore[reportReturnType]
+
+
 @helper_kernel("int64(int64[::1], int64)")
 def read(box: Words, register: int) -> int:
     """A register of the card; FAILED if the library reports an error."""
-    box[ERROR] = call_c(box[GET], box[HANDLE], register, box[VALUE])
+    call_library(box, box[GET], register, box[VALUE])
     return FAILED if box[ERROR] else box[FOUND]  # pyright: ignore[reportReturnType]
 
 
 @helper_kernel("int64(int64[::1], int64)")
 def hand_over(box: Words, n_samples: int) -> int:
     """Let the card fetch samples that are in the ring; returns 0 or FAILED."""
-    box[ERROR] = call_c(box[SET], box[HANDLE], CARD_LEN, n_samples * FRAME_BYTES)
-    if box[ERROR]:
+    if call_library(box, box[SET], CARD_LEN, n_samples * FRAME_BYTES):
         return FAILED
     box[WRITTEN] += n_samples
     return 0
@@ -332,8 +345,7 @@ def start_when_filled(box: Words) -> int:
             box[FILLED_BY_NS] = box[NOW_NS] + FILLING_NS
         return STUCK if box[NOW_NS] > box[FILLED_BY_NS] else FILLING_POLL_NS
     box[IS_FILLING] = box[FILLED_BY_NS] = 0
-    box[ERROR] = call_c(box[SET], box[HANDLE], COMMAND, box[START_COMMAND])
-    return FAILED if box[ERROR] else 0
+    return FAILED if call_library(box, box[SET], COMMAND, box[START_COMMAND]) else 0
 
 
 @kernel("int64(int64[::1], int64)")

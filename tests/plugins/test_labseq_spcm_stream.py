@@ -349,13 +349,19 @@ def play_when_the_computer_is_not_held_up(lab: Lab, program: ToneProgram) -> Non
     pytest.fail("the card ran dry a hundred times")
 
 
-def test_in_real_time_a_thread_feeds_the_card_until_it_is_safe() -> None:
+def slow_context() -> Context:
+    """Of a lab in real time whose tones need 50 MS/s only."""
     tones_hz, band = np.linspace(12e6, 18e6, 5), (10e6, 20e6)
     grid = SiteGrid(5, 5, row_frequency_hz=tones_hz, column_frequency_hz=tones_hz)
     motion = MotionSpec(rf=RfSpec(row_band_hz=band, column_band_hz=band))
+    return Context("mobile_tweezers", grid, motion=motion)
+
+
+def test_in_real_time_a_thread_feeds_the_card_until_it_is_safe() -> None:
+    context = slow_context()
+    motion = context.motion
     plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])])  # handed over as a whole by play()
-    program = tone_program(plan, grid, motion)
-    context = Context("mobile_tweezers", grid, motion=motion)
+    program = tone_program(plan, context.grid, motion)
     card = SimulatedCard(context.clock)
     assert not context.clock.virtual
     with installed(card) as name:
@@ -375,6 +381,52 @@ def test_in_real_time_a_thread_feeds_the_card_until_it_is_safe() -> None:
                     thread.join(60.0)
                 assert not threads()
                 assert (card.running, card.outputs_on) == (False, (False, False))
+        finally:
+            tweezers.close()
+
+
+class Watched(SimulatedCard):
+    """A card that notes whether a call comes from another thread while one is under way.
+
+    The owner's first reading of the serial number waits for such a call for 0.1 s.
+    """
+
+    entered: threading.Event | None = None
+    owner = 0
+
+    def read(self, register: int) -> tuple[int, int | float]:
+        if self.entered is not None and threading.get_ident() != self.owner:
+            self.entered.set()
+        if register == registers.SPC_PCISERIALNO and threading.get_ident() == self.owner:
+            self.entered = threading.Event()
+            self.meanwhile()
+            self.is_alone = not self.entered.wait(0.1)
+            self.entered = None
+        return super().read(register)
+
+    def meanwhile(self) -> None:
+        """What another thread begins now."""
+
+
+@pytest.mark.parametrize("mode", ["replay", "stream"])
+def test_the_driver_library_is_called_by_one_thread_at_a_time(mode: str) -> None:
+    """By another thread of Python's, or by the loop of a stream."""
+    context = slow_context()
+    card = Watched(context.clock)
+    with installed(card) as name:
+        settings = SpcmSettings(card=name, mode=mode, sample_rate=50e6, fill=20e-3)  # type: ignore[arg-type]
+        tweezers: Any = SpcmMobileTweezers(settings, context)
+        tweezers.warm()
+        tweezers.open()
+        try:
+            tweezers.settle()
+            card.owner = threading.get_ident()
+            other = threading.Thread(target=lambda: tweezers._card.status)
+            card.meanwhile = other.start if mode == "replay" else lambda: None  # type: ignore[method-assign]
+            assert tweezers._card.serial_number == 12345
+            assert card.is_alone
+            if mode == "replay":
+                other.join(60.0)
         finally:
             tweezers.close()
 
