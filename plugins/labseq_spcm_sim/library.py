@@ -229,8 +229,14 @@ class Library:
     _dwgeterrorinfo_i64 = partialmethod(_take_error, ctypes.c_int64)
     _dwgeterrorinfo_d64 = partialmethod(_take_error, ctypes.c_double)
 
-    def _dwgetcontbuf_i64(self, _handle: int | None, _kind: int, _out: int, _length: int) -> int:
-        return r.ERR_FNCNOTSUPPORTED
+    def _dwgetcontbuf_i64(self, handle: int | None, _kind: int, out: int, length: int) -> int:
+        card = self._open.get(handle or 0)
+        if card is None:
+            return r.ERR_INVALIDHANDLE
+        address, n_bytes = card.continuous_buffer()
+        _put_number(ctypes.c_int64, out, address)
+        _put_number(ctypes.c_int64, length, n_bytes)
+        return r.ERR_OK
 
     def _dwdiscovery(self, *_: Any) -> int:
         return r.ERR_OK
@@ -267,13 +273,22 @@ class SimulatedLibrary:
         clock: The session's time.
         simulation: Receives what the card plays, if it implements ``ReceivesOutput``.
         row_channel: Channel that drives the row axis; the other drives the columns.
+        new_card: Makes the card; takes the arguments of :class:`SimulatedCard`.
 
     Attributes:
         card: The new card in this process, while connected.
     """
 
-    def __init__(self, name: str, clock: Clock, simulation: Simulation | None, row_channel: int) -> None:
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        simulation: Simulation | None,
+        row_channel: int,
+        new_card: Callable[..., SimulatedCard] = SimulatedCard,
+    ) -> None:
         self._name = name
+        self._new_card = new_card
         self._clock = clock
         self._simulation = simulation
         self._row_channel = row_channel
@@ -295,7 +310,7 @@ class SimulatedLibrary:
         if self._name != PREFIX:
             return self._name
         received = isinstance(self._simulation, ReceivesOutput)
-        self.card = card = SimulatedCard(self._clock, keep_history=received)
+        self.card = card = self._new_card(self._clock, keep_history=received)
         self.wire(card)
         return install(card)
 

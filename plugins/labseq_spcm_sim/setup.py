@@ -37,6 +37,7 @@ class CardModel:
         bus_bytes_per_s: Transfer from the PC; PCIe x8 Gen 2.
         temperature_c: What its sensors read, in degrees Celsius (ours).
         firmware_type: 1 for its own, 2 for the recovery firmware.
+        continuous_bytes: Length of the driver's continuous buffer, which a user sets up; none by default.
     """
 
     name: str = "M4i.6631-x8"
@@ -52,6 +53,7 @@ class CardModel:
     bus_bytes_per_s: float = 2.8e9
     temperature_c: int = 45
     firmware_type: int = 1
+    continuous_bytes: int = 0
 
 
 M4I6631: Final = CardModel()
