@@ -16,8 +16,7 @@ What only some plugins need is in modules by subject:
 - ``simulation``: what simulated devices pass to a simulation that acts on their outputs
 - ``system``: folders for files that outlive a run, other processes, a clock outside of a run
 - ``tweezers``: checks and amplitudes that drivers of static tweezers share
-- ``units``: quantities as text
-- ``wire``: messages between computers
+- ``units``, ``wire``: quantities as text; messages between computers
 
 A plugin needs no other module of labseq, except :mod:`labseq.testing` in its tests.
 """
