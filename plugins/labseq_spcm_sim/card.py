@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from labseq.plugin import Clock, StopRequested
 from labseq_spcm_sim import registers as r
-from labseq_spcm_sim.faults import Faults
+from labseq_spcm_sim.faults import COPY_BYTES_PER_S, Faults
 from labseq_spcm_sim.machine import Machine
 from labseq_spcm_sim.modes import Buffer
 from labseq_spcm_sim.output import SampleSpan
@@ -84,7 +84,7 @@ class SimulatedCard:
         self._keep_history = keep_history
         self._lock = threading.RLock()
         self._machine = Machine(model, keeps_streams=keep_history, faults=faults)
-        self._pinning_s = faults.pinning_s
+        self._faults = faults
         self._continuous: mmap.mmap | None = None
         self._error = ErrorInfo()
         self._edges_s: list[float] = []
@@ -232,7 +232,14 @@ class SimulatedCard:
 
     def write(self, register: int, value: Number) -> int:
         """Write one register."""
+        if register == r.SPC_DATA_AVAIL_CARD_LEN and self._faults.copies_samples:
+            self._take(int(value) / COPY_BYTES_PER_S)
         return self.write_all([(register, value)])
+
+    def _take(self, duration_s: float) -> None:
+        """Take the time that a call takes."""
+        with suppress(StopRequested):  # nothing may pass through C; the caller's next wait raises it
+            self._clock.sleep(duration_s)
 
     def write_all(self, writes: Iterable[tuple[int, Number]]) -> int:
         """Write registers one after the other, up to the first that is refused."""
@@ -265,8 +272,7 @@ class SimulatedCard:
 
     def define_transfer(self, kind: int, direction: int, offset: int, buffer: Buffer) -> int:
         """Name the buffer of the next transfer."""
-        with suppress(StopRequested):  # nothing may pass through C; the caller's next wait raises it
-            self._clock.sleep(self._pinning_s)
+        self._take(self._faults.pinning_s)
         with self._lock:
             if self._error.code:
                 return r.ERR_LASTERR

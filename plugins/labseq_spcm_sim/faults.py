@@ -20,6 +20,9 @@ MANUAL_SPEEDS: Final = (
 CONTINUOUS_BYTES_PER_S: Final = 2549e6
 """The same from the driver's continuous buffer (same table)."""
 
+COPY_BYTES_PER_S: Final = 8e9
+"""Speed at which handed-over samples are copied, if they are (ours)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Faults:
