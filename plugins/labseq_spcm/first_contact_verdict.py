@@ -93,8 +93,8 @@ def _naming(result: Result, _settings: SpcmSettings) -> str:
 
 
 def _threads(result: Result, _settings: SpcmSettings) -> str:
-    text = "an error in one thread makes calls of another fail: calls of one card need a lock"
-    return text if result["errors_of_the_other_thread"] else ""
+    text = f"{result['failed_reads']} of {result['reads']} reads from two threads at once failed"
+    return text if result["failed_reads"] else ""
 
 
 def _second(result: Result, _settings: SpcmSettings) -> str:
