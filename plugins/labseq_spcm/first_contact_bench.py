@@ -264,7 +264,11 @@ class Transfer:
     @property
     def reported(self) -> int:
         """Bytes that the card reports as fetched."""
-        return self.handed - (self.frames.nbytes - self.user_bytes)
+        return self.fetched(self.user_bytes)
+
+    def fetched(self, user_bytes: int) -> int:
+        """Bytes that are fetched when so many are free for the user."""
+        return self.handed - (self.frames.nbytes - user_bytes)
 
     def start_dma(self) -> None:
         """Let the card fetch what is handed over."""
@@ -275,10 +279,9 @@ class Transfer:
         self._card.write(self._card.spcm.SPC_DATA_AVAIL_CARD_LEN, n_bytes, "handing samples over")
         self.handed += n_bytes
 
-    def feed(self) -> None:
-        """Hand over all whole blocks that are free."""
-        free = self.user_bytes // self.notify_bytes * self.notify_bytes
-        if free:
+    def feed(self, user_bytes: int) -> None:
+        """Hand over all whole blocks of what is free."""
+        if free := user_bytes // self.notify_bytes * self.notify_bytes:
             self.hand_over(free)
 
     def play(self) -> None:

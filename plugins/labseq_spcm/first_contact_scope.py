@@ -73,14 +73,14 @@ def overwrite(bench: Bench) -> dict[str, Any]:
     Returns:
         The bursts that were written, their length, and how far ahead of the reported position, in seconds.
     """
-    settings, rate_hz = bench.settings, bench.card.read(bench.card.spcm.SPC_SAMPLERATE)
+    settings = bench.settings
     block = settings.notify_size // limits.FRAME_BYTES
     frames = bench.silence(16 << 20)
     transfer = bench.transfer(frames, settings.notify_size, settings.card_buffer, at_full_rate=True)
     rate_hz = bench.card.read(bench.card.spcm.SPC_SAMPLERATE)
     on_card = (settings.card_buffer + limits.OUTPUT_FIFO_BYTES) / limits.FRAME_BYTES
     ahead = max(2, int((settings.look_ahead_s(rate_hz) * rate_hz - on_card) / block))
-    burst, n_blocks = tone(block), len(frames) // block
+    burst, ring = tone(block), frames.reshape(-1, block, 2)
     transfer.hand_over(frames.nbytes)
     transfer.start_dma()
     transfer.settled()
@@ -90,14 +90,15 @@ def overwrite(bench: Bench) -> dict[str, Any]:
     next_s, places = bench.now() + BURST_PAUSE_S, list[int]()
     while len(places) < N_BURSTS or bench.now() < next_s:
         bench.look_again(20e-6)
-        transfer.feed()
-        fetched = transfer.reported // settings.notify_size
+        user_bytes = transfer.user_bytes
+        fetched = transfer.fetched(user_bytes) // settings.notify_size
+        if places and fetched > places[-1]:  # silent again before the block is handed over once more:
+            ring[places[-1] % len(ring)] = 0  # a card that copied it then would play it a round later
+        transfer.feed(user_bytes)
         if len(places) < N_BURSTS and bench.now() >= next_s:
             next_s += BURST_PAUSE_S
             places.append(fetched + ahead)
-            frames.reshape(n_blocks, block, 2)[places[-1] % n_blocks] = burst
-        if places and fetched > places[-1] + ahead:  # played: the ring is silent again
-            frames.reshape(n_blocks, block, 2)[places[-1] % n_blocks] = 0
+            ring[places[-1] % len(ring)] = burst
     bench.card.stop()
     return {"written": N_BURSTS, "burst_s": block / rate_hz, "ahead_s": ahead * block / rate_hz}
 

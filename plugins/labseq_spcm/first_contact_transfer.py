@@ -146,9 +146,9 @@ def _playing(bench: Bench) -> tuple[float, float]:
     rate = bench.card.read(bench.card.spcm.SPC_SAMPLERATE) * FRAME_BYTES
     start_s, seen = bench.now(), list[tuple[float, int]]()
     while (now_s := bench.now()) - start_s < FOLLOWED_S:
-        count = transfer.reported
-        if seen and count != seen[-1][1]:
-            transfer.feed()
+        user_bytes = transfer.user_bytes
+        count = transfer.fetched(user_bytes)
+        transfer.feed(user_bytes)
         if not seen or count != seen[-1][1]:
             seen.append((now_s, count))
         bench.look_again(5e-6)
@@ -202,10 +202,10 @@ def sustained(bench: Bench) -> dict[str, Any]:
     start_s = bench.now()
     ran_dry = False
     while not ran_dry and bench.now() - start_s < SUSTAINED_S:
-        bench.look_again(POLL_S)
+        bench.look_again(5 * POLL_S)
         ran_dry = bool(card.status & (spcm.M2STAT_DATA_OVERRUN | spcm.M2STAT_CARD_READY))
         if not ran_dry:
-            transfer.feed()
+            transfer.feed(transfer.user_bytes)
     played_s = bench.now() - start_s
     card.stop()
     return {"sample_rate_hz": bench.settings.sample_rate, "played_s": played_s, "ran_dry": ran_dry}
