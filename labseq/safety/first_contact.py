@@ -241,6 +241,7 @@ class _Meeting:
             unsafe = attempt(self._guard, self._name, self._timeouts.safe_state_s, self._contact.safe_state)
         if unsafe is not None:
             raise unsafe
+        self._stop.check()
         if not {"failed", "skipped"} & result.keys():
             result |= {reading.name: self._dialogue.reads(reading, self._stop) for reading in step.readings}
         self._dialogue.ended(result)
