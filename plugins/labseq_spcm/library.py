@@ -86,15 +86,17 @@ def choose_library(name: str, settings: SpcmSettings, context: Context) -> Libra
 
     Raises:
         DeviceError: The package ``spcm_core`` is missing, from which the simulated card has its registers.
+        ConfigError: The file that ``faults.first_contact`` names is missing or was edited.
     """
     if not settings.card.startswith(SIMULATED):
         return VendorLibrary(settings.card)
     try:
-        from labseq_spcm_sim import SimulatedLibrary
+        from labseq_spcm_sim import SimulatedLibrary, card_with
     except ModuleNotFoundError as error:
         raise _not_installed(name, error) from error
+    new_card = card_with(settings.faults.model_dump(), settings.model)
     return SimulatedLibrary(
-        settings.card, context.clock, context.simulation, *settings.outputs, model=settings.model
+        settings.card, context.clock, context.simulation, *settings.outputs, new_card=new_card
     )
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from labseq.plugin import (
     ConfigError,
@@ -40,6 +40,9 @@ from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.set_up import check_type, close_relays, set_amplitude, set_up, switch_output, versions
 from labseq_spcm.settings import NO_TRIGGER, SpcmSettings
 from labseq_spcm.stream import Stream, check_rendering
+
+if TYPE_CHECKING:
+    from labseq.plugin.first_contact import FirstContact
 
 RAMP_STEPS: Final = 15
 HOT_C: Final = 80
@@ -375,6 +378,12 @@ class SpcmMobileTweezers(MobileTweezers):
         """The card is stopped, and its outputs are disabled, by the vendor's library alone."""
         script = Path(__file__).with_name("emergency.py")
         return None if self._card is None else self.library.emergency(script, self._card.n_outputs)
+
+    def first_contact(self) -> FirstContact:
+        """Steps that prove what this driver assumes about the card."""
+        from labseq_spcm.first_contact import SpcmFirstContact
+
+        return SpcmFirstContact(self._settings, self._context, self.library)
 
     def self_test(self) -> None:
         """Check the card's firmware, temperatures, clock and memory, outputs off; drops the prepared program.

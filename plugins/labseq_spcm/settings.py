@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, field_validator, model_validator
 
-from labseq.plugin import Duration, Frequency, Settings, Voltage, format_quantity
+from labseq.plugin import Duration, FilePath, Frequency, Settings, Voltage, format_quantity
 from labseq_spcm import limits
 from labseq_spcm.models import ANY, MODELS, Model
 
@@ -27,6 +27,31 @@ class KeepWarmSettings(Settings):
         default=None,
         description="of full scale, on both axes; none: the mean power of as many tones as the profile "
         "allows at once",
+    )
+
+
+class CardFaults(Settings):
+    """What the simulated card does otherwise than the driver assumes; nothing by default."""
+
+    copies_samples: bool = Field(
+        default=False,
+        description="samples are copied when they are handed over, as with a NETBOX or a bounce buffer",
+    )
+    position_lag: Duration = Field(default=0.0, description="how late the position of a transfer is reported")
+    fifo_short: int = Field(
+        default=0, ge=0, description="bytes by which the card's buffer is smaller than its size"
+    )
+    pinning: Duration = Field(default=0.0, description="time to name a transfer buffer")
+    underrun_not_ready: bool = Field(
+        default=False, description="a card that ran dry reports the overrun, but not that it is ready"
+    )
+    slow_small_blocks: bool = Field(
+        default=False, description="small notify sizes slow the bus down, as in the manual's table"
+    )
+    first_contact: FilePath | None = Field(
+        default=None,
+        description="file of `labseq first-contact`: the simulated card does what was measured there; none: "
+        "what the driver assumes",
     )
 
 
@@ -96,6 +121,9 @@ class SpcmSettings(Settings):
         ge=1 << 13,
         le=1 << 24,
         description="stream: bytes of on-board memory that are used, a power of two, at least 2 notify_size",
+    )
+    faults: CardFaults = Field(
+        default=CardFaults(), description="what the simulated card does otherwise than a real one should"
     )
     keep_warm: KeepWarmSettings | None = Field(
         default=None, description="stream: tones off the atoms between programs; none: silence"

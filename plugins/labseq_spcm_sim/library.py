@@ -30,7 +30,7 @@ from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.card import DRIVER_VERSION, SimulatedCard
 from labseq_spcm_sim.modes import Buffer
 from labseq_spcm_sim.output import FULL_SCALE, SampleSpan
-from labseq_spcm_sim.setup import M4I6631, MODELS, ErrorInfo, Number
+from labseq_spcm_sim.setup import ErrorInfo, Number
 
 Slot = ctypes.c_int32 | ctypes.c_uint32 | ctypes.c_int64 | ctypes.c_double
 
@@ -229,8 +229,14 @@ class Library:
     _dwgeterrorinfo_i64 = partialmethod(_take_error, ctypes.c_int64)
     _dwgeterrorinfo_d64 = partialmethod(_take_error, ctypes.c_double)
 
-    def _dwgetcontbuf_i64(self, _handle: int | None, _kind: int, _out: int, _length: int) -> int:
-        return r.ERR_FNCNOTSUPPORTED
+    def _dwgetcontbuf_i64(self, handle: int | None, _kind: int, out: int, length: int) -> int:
+        card = self._open.get(handle or 0)
+        if card is None:
+            return r.ERR_INVALIDHANDLE
+        address, n_bytes = card.continuous_buffer()
+        _put_number(ctypes.c_int64, out, address)
+        _put_number(ctypes.c_int64, length, n_bytes)
+        return r.ERR_OK
 
     def _dwdiscovery(self, *_: Any) -> int:
         return r.ERR_OK
@@ -268,7 +274,7 @@ class SimulatedLibrary:
         simulation: Receives what the card plays, if it implements ``ReceivesOutput``.
         row_channel: Channel that drives the row axis.
         column_channel: Channel that drives the columns; None: the other one of 0 and 1.
-        model: What card a new one is, of ``MODELS``; "": an M4i.6631-x8.
+        new_card: Makes the card; takes the arguments of :class:`SimulatedCard`.
 
     Attributes:
         card: The new card in this process, while connected.
@@ -281,10 +287,10 @@ class SimulatedLibrary:
         simulation: Simulation | None,
         row_channel: int,
         column_channel: int | None = None,
-        model: str = "",
+        new_card: Callable[..., SimulatedCard] = SimulatedCard,
     ) -> None:
         self._name = name
-        self._model = model
+        self._new_card = new_card
         self._column_channel = column_channel
         self._clock = clock
         self._simulation = simulation
@@ -307,11 +313,7 @@ class SimulatedLibrary:
         if self._name != PREFIX:
             return self._name
         received = isinstance(self._simulation, ReceivesOutput)
-        if self._model and self._model not in MODELS:
-            text = f"there is no simulated {self._model}; expected one of {', '.join(MODELS)}"
-            raise DeviceError("spcm simulator", f"{text}, or no `model`")
-        model = MODELS.get(self._model, M4I6631)
-        self.card = card = SimulatedCard(self._clock, model=model, keep_history=received)
+        self.card = card = self._new_card(self._clock, keep_history=received)
         self.wire(card)
         return install(card)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from labseq_spcm_sim import registers as r
+from labseq_spcm_sim.faults import Faults
 from labseq_spcm_sim.modes import Buffer, Fifo, Memory, Replay, Run, Stretch
 from labseq_spcm_sim.output import Amplifier, SampleSpan
 from labseq_spcm_sim.setup import (
@@ -51,10 +52,16 @@ class Machine:
     Args:
         model: What card it is.
         keeps_streams: Whether samples of streams are kept, not only those of replays.
+        faults: What it does otherwise than by default.
+
+    Attributes:
+        continuous: Address of the driver's continuous buffer, whose length the model has.
     """
 
-    def __init__(self, model: CardModel, *, keeps_streams: bool) -> None:
+    def __init__(self, model: CardModel, *, keeps_streams: bool, faults: Faults = Faults()) -> None:  # noqa: B008
         self.model = model
+        self._faults = faults
+        self.continuous = 0
         self._keeps_streams = keeps_streams
         self.amplifiers = tuple(Amplifier(model) for _ in range(model.n_channels))
         self.samples: list[Record] = []
@@ -62,7 +69,7 @@ class Machine:
 
     def _power_on(self) -> None:
         self.setup = Setup(self.model)
-        self.memory = Memory(self.model.bus_bytes_per_s)
+        self.memory = Memory()
         self.buffer: Buffer | None = None
         self.fifo: Fifo | None = None
         self.run: Run | None = None
@@ -87,6 +94,7 @@ class Machine:
             if self.run.finished or self.run.failed:
                 self.underrun = self.run.failed
                 self._end_run(now_s)
+                self.running = self.underrun and self._faults.underrun_not_ready
 
     def _end_run(self, now_s: float) -> None:
         self.samples += self._run_samples(now_s)
@@ -246,10 +254,17 @@ class Machine:
         if setup.mode == r.SPC_REP_FIFO_SINGLE:
             if self.running:
                 raise Refusal(r.ERR_RUNNING, "card is still running, access not possible")
-            self.memory = Memory(self.model.bus_bytes_per_s)  # the FIFO takes its place
+            self.memory = Memory()  # the FIFO takes its place
             rate_hz, room_bytes = setup[r.SPC_SAMPLERATE], setup.on_card(r.SPC_DATA_OUTBUFSIZE)
-            bus = self.model.bus_bytes_per_s
-            self.fifo = Fifo(buffer, setup.frame_bytes, rate_hz, room_bytes, bus, keeps=self._keeps_streams)
+            self.fifo = Fifo(
+                buffer,
+                setup.frame_bytes,
+                rate_hz,
+                room_bytes,
+                self._speed(buffer),
+                self._faults,
+                keeps=self._keeps_streams,
+            )
         elif buffer.n_bytes > (room := setup[r.SPC_MEMSIZE] * setup.frame_bytes):
             raise refuse(buffer.n_bytes, f"at most {room} bytes; set the memory size first")
         self.buffer = buffer
@@ -260,8 +275,16 @@ class Machine:
         if self.fifo is not None:
             self.fifo.switch_dma(on=True, now_s=now_s)
             return
-        self.memory.send(now_s, self.buffer.fetch(0, self.buffer.n_bytes).copy())
+        data = self.buffer.fetch(0, self.buffer.n_bytes).copy()
+        self.memory.send(now_s, data, self._speed(self.buffer))
         self.buffer = None  # it is used only once
+
+    def _speed(self, buffer: Buffer) -> float:
+        """Speed of a transfer, in bytes per second."""
+        offset = buffer.address - self.continuous
+        continuous = 0 <= offset < self.model.continuous_bytes
+        bus = self.model.bus_bytes_per_s
+        return self._faults.write_speed(buffer.notify_bytes, bus, continuous=continuous)
 
     @property
     def is_transferring(self) -> bool:

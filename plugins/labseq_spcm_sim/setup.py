@@ -43,6 +43,7 @@ class CardModel:
         reference_hz: The signal at the clock input; 0: none.
         reference_divider: The PLL divides it by this, and multiplies the result by whole numbers (ours).
         firmware_type: 1 for its own, 2 for the recovery firmware.
+        continuous_bytes: Length of the driver's continuous buffer, which a user sets up; none by default.
     """
 
     name: str = "M4i.6631-x8"
@@ -64,6 +65,7 @@ class CardModel:
     reference_hz: float = 10e6
     reference_divider: int = 16
     firmware_type: int = 1
+    continuous_bytes: int = 0
 
 
 M4I6631: Final = CardModel()
