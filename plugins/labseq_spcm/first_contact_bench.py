@@ -259,8 +259,8 @@ class Transfer:
 
     Attributes:
         handed: Bytes handed over so far.
-        is_new_free: Whether a new buffer counts as free for the user. By the manual it counts as full: what is
-            free is then what was fetched, until the whole buffer has been handed over.
+        is_new_free: Whether a new buffer counts as free for the user. By the manual it counts as full: what
+            is free is then what was fetched, until the whole buffer has been handed over.
     """
 
     is_new_free = False
