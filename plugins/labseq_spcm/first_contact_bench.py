@@ -178,6 +178,23 @@ class Bench:
             self.look_again(poll_s)
         return self.now() - start_s
 
+    def last_missed(self, condition: Callable[[], bool], limit_s: float, what: str) -> float:
+        """Wait for a condition; returns after which time it was certainly not met yet, in seconds.
+
+        The look that finds it met may come much later, because the computer was busy with something else.
+        """
+        missed_s, start_s = list[float](), self.now()
+
+        def is_met() -> bool:
+            looked_s = self.now()
+            met = condition()
+            if not met:
+                missed_s.append(looked_s)
+            return met
+
+        self.until(is_met, limit_s, what)
+        return missed_s[-1] - start_s if missed_s else 0.0
+
     # The card
 
     def told(self, register: int) -> int | None:
