@@ -54,7 +54,7 @@ class SpcmFirstContact(FirstContact):
 
     def emergency(self) -> Emergency | None:
         """The driver's script."""
-        return self._bench.library.emergency(Path(__file__).with_name("emergency.py"))
+        return self._bench.emergency(Path(__file__).with_name("emergency.py"))
 
     def judge(self, measured: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Any]:
         """See :func:`labseq_spcm.first_contact_verdict.judge`."""

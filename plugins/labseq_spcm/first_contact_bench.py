@@ -6,19 +6,22 @@ import ctypes
 import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Context, DeviceError, DeviceTimeoutError, MobileTweezers
+from labseq.plugin import Context, DeviceError, DeviceTimeoutError, Emergency, MobileTweezers
 from labseq_spcm import limits
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.library import Library
+from labseq_spcm.models import ANY
 from labseq_spcm.set_up import check_type, set_up, switch_output, versions
 from labseq_spcm.settings import SpcmSettings
 
-LOWEST_MV: Final = limits.AMPLITUDE_MV[0]
+LOWEST_MV: Final = ANY.amplitude_mv[0]
 """The only amplitude of a first contact, but for the step that tries the safe ramp."""
 Driver = TypeVar("Driver", bound=MobileTweezers)
 
@@ -37,6 +40,7 @@ class Bench:
         self.settings, self.context, self.library = settings, context, library
         self._clock = context.clock
         self._card: AwgCard | None = None
+        self._n_outputs = 2
         self._is_lent = False
         self._borrower: MobileTweezers | None = None
 
@@ -56,7 +60,8 @@ class Bench:
         if self._card is None:
             card = self._card = AwgCard(self.name, self.library, self._clock)
             try:
-                check_type(card, self.settings)
+                card.n_outputs = self._n_outputs = check_type(card, self.settings).n_outputs
+                card.outputs = tuple(sorted(self.settings.outputs))
             except BaseException:
                 self.close()
                 raise
@@ -67,6 +72,10 @@ class Bench:
             "driver": software["driver"][0],
             "firmware": software["main control firmware"][0],
         }
+
+    def emergency(self, script: Path) -> Emergency | None:
+        """A script that another process can run on the card; None for one that dies with this process."""
+        return self.library.emergency(script, self._n_outputs)
 
     def close(self) -> None:
         """Close the card; what it does goes on."""
@@ -126,8 +135,7 @@ class Bench:
             return
         for step in (
             card.stop,
-            lambda: switch_output(card, 0, on=False),
-            lambda: switch_output(card, 1, on=False),
+            *(partial(switch_output, card, output, on=False) for output in range(card.n_outputs)),
             card.write_setup,
             lambda: card.command(card.spcm.M2CMD_CARD_RESET, "reset"),
         ):
@@ -232,7 +240,9 @@ class Bench:
         card.set(spcm.SPC_DATA_OUTBUFSIZE, card_bytes, "size of the card's buffer in bytes")
         card.write_setup()
         card.define_transfer(frames, notify_bytes)
-        return Transfer(self, frames, notify_bytes)
+        new = Transfer(self, frames, notify_bytes)
+        new.is_new_free = new.user_bytes > 0
+        return new
 
     def silence(self, n_bytes: int) -> NDArray[np.int16]:
         """A buffer of zeros whose pages are in memory, int16 (n, 2)."""
@@ -266,7 +276,11 @@ class Transfer:
 
     Attributes:
         handed: Bytes handed over so far.
+        is_new_free: Whether a new buffer counts as free for the user. By the manual it counts as full; what
+            is free is then what was fetched, until the whole buffer has been handed over.
     """
+
+    is_new_free = False
 
     def __init__(self, bench: Bench, frames: NDArray[np.int16], notify_bytes: int) -> None:
         self._bench, self._card, self.frames = bench, bench.card, frames
@@ -285,7 +299,8 @@ class Transfer:
 
     def fetched(self, user_bytes: int) -> int:
         """Bytes that are fetched when so many are free for the user."""
-        return self.handed - (self.frames.nbytes - user_bytes)
+        behind = self.handed - self.frames.nbytes
+        return user_bytes + (behind if self.is_new_free else max(0, behind))
 
     def start_dma(self) -> None:
         """Let the card fetch what is handed over."""

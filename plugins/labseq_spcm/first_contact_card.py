@@ -122,8 +122,8 @@ def _pinned_s(bench: Bench, frames: Any) -> float:
 
 
 def _open_relays(bench: Bench) -> None:
-    switch_output(bench.card, 0, on=False)
-    switch_output(bench.card, 1, on=False)
+    for output in bench.card.outputs:
+        switch_output(bench.card, output, on=False)
     bench.card.write_setup()
 
 
@@ -215,13 +215,11 @@ def second_process(bench: Bench, *, with_tone: bool = False) -> dict[str, Any]:
         Whether the card ran on after its process had died, how long it could not be opened again, what the
         emergency script did and how long it took, in seconds.
     """
-    playing, emergency = (
-        bench.library.emergency(SCRIPT),
-        bench.library.emergency(SCRIPT.with_name("emergency.py")),
-    )
+    playing, emergency = bench.emergency(SCRIPT), bench.emergency(SCRIPT.with_name("emergency.py"))
     if playing is None or emergency is None:
         return {"skipped": "the simulated card lives in this process and dies with it"}
-    arguments = {**playing.arguments, "rate_hz": round(bench.settings.sample_rate), "relays": with_tone}
+    found = {key: value for key, value in playing.arguments.items() if key != "n_outputs"}
+    arguments = {**found, "rate_hz": round(bench.settings.sample_rate), "relays": with_tone}
     with bench.lent(), _running(bench, playing.script, "play", arguments) as child:
         bench.pause(ALONE_S if with_tone else 0.05)
         child.kill()

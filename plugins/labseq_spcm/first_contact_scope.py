@@ -60,7 +60,7 @@ def relay_steps(bench: Bench) -> dict[str, Any]:
     for _ in range(N_SWITCHED):
         close_relays(bench.card)
         bench.pause(SWITCHED_S)
-        for channel in (0, 1):
+        for channel in bench.card.outputs:
             switch_output(bench.card, channel, on=False)
         bench.card.write_setup()
         bench.pause(SWITCHED_S)

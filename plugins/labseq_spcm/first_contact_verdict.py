@@ -45,12 +45,6 @@ def _copied(result: Result, _settings: SpcmSettings) -> str:
     return f"{text}, at {1e-9 / s_per_byte:.3g} GB/s" if s_per_byte > COPIED_S_PER_BYTE else ""
 
 
-def _user_len(result: Result, _settings: SpcmSettings) -> str:
-    free = result["user_len_bytes"]["after_def_transfer"]
-    text = f"directly after DefTransfer {free} of {result['buffer_bytes']} bytes are free for the user"
-    return text if free < result["buffer_bytes"] else ""
-
-
 def _lag(result: Result, settings: SpcmSettings) -> str:
     block_s = settings.notify_size / FRAME_BYTES / settings.sample_rate
     late, block = (format_quantity(s, "time") for s in (result["worst_s"], block_s))
@@ -134,7 +128,6 @@ STREAM: Final[tuple[tuple[str, Claim], ...]] = (
 ALL_MODES: Final[tuple[tuple[str, Claim], ...]] = (
     ("identity", _warm),
     ("times", _naming),
-    ("positions", _user_len),
     ("starve", _ready),
     ("threads", _threads),
     ("second_process", _second),

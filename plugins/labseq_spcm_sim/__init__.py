@@ -14,9 +14,11 @@ from labseq_spcm_sim.faults import Faults
 from labseq_spcm_sim.library import CardOutputs, SimulatedLibrary, install, installed, vendor_library_found
 from labseq_spcm_sim.measured import card_with
 from labseq_spcm_sim.output import SampleSpan
-from labseq_spcm_sim.setup import M4I6631, CardModel, ErrorInfo, trigger_delay_s
+from labseq_spcm_sim.setup import M4I6621, M4I6622, M4I6631, CardModel, ErrorInfo, trigger_delay_s
 
 __all__ = [
+    "M4I6621",
+    "M4I6622",
     "M4I6631",
     "CardModel",
     "CardOutputs",

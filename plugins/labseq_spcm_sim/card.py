@@ -167,10 +167,10 @@ class SimulatedCard:
             return self._machine.running
 
     @property
-    def outputs_on(self) -> tuple[bool, bool]:
-        """Whether the output relays of the two channels are closed."""
+    def outputs_on(self) -> tuple[bool, ...]:
+        """Whether the output relay of each channel is closed."""
         with self._lock:
-            return self._machine.amplifiers[0].enabled, self._machine.amplifiers[1].enabled
+            return tuple(amplifier.enabled for amplifier in self._machine.amplifiers)
 
     # Functions of the driver library; most return the vendor's error code
 
@@ -186,6 +186,11 @@ class SimulatedCard:
             self._machine.stop_dma(self._advance())
             self._machine.buffer = None
             self._is_open = False
+
+    @property
+    def step_time_s(self) -> float:
+        """The time of the step that is being called, else that of the clock."""
+        return self._now()
 
     def _now(self) -> float:
         return self._clock.now() if self._within_step_s is None else self._within_step_s
@@ -243,6 +248,14 @@ class SimulatedCard:
 
     def write_all(self, writes: Iterable[tuple[int, Number]]) -> int:
         """Write registers one after the other, up to the first that is refused."""
+        code = self._write_all(writes)
+        busy_s, self._machine.busy_s = self._machine.busy_s, 0.0
+        if busy_s:
+            with suppress(StopRequested):  # nothing may pass through C; the caller's next wait raises it
+                self._clock.sleep(busy_s)
+        return code
+
+    def _write_all(self, writes: Iterable[tuple[int, Number]]) -> int:
         with self._lock:
             if self._error.code:
                 return r.ERR_LASTERR

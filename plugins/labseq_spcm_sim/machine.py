@@ -10,10 +10,19 @@ from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.faults import Faults
 from labseq_spcm_sim.modes import Buffer, Fifo, Memory, Replay, Run, Stretch
 from labseq_spcm_sim.output import Amplifier, SampleSpan
-from labseq_spcm_sim.setup import UNKNOWN, CardModel, Number, Refusal, Setup, refuse, trigger_delay_s
+from labseq_spcm_sim.setup import (
+    AMPLITUDES,
+    OUTPUTS,
+    PLL_LOCK_S,
+    UNKNOWN,
+    CardModel,
+    Number,
+    Refusal,
+    Setup,
+    refuse,
+    trigger_delay_s,
+)
 
-AMPLITUDES: Final = {r.SPC_AMP0: 0, r.SPC_AMP1: 1}
-OUTPUTS: Final = {r.SPC_ENABLEOUT0: 0, r.SPC_ENABLEOUT1: 1}
 WAITS: Final = r.M2CMD_CARD_WAITTRIGGER | r.M2CMD_CARD_WAITREADY | r.M2CMD_DATA_WAITDMA
 
 
@@ -54,7 +63,7 @@ class Machine:
         self._faults = faults
         self.continuous = 0
         self._keeps_streams = keeps_streams
-        self.amplifiers = (Amplifier(model), Amplifier(model))
+        self.amplifiers = tuple(Amplifier(model) for _ in range(model.n_channels))
         self.samples: list[Record] = []
         self._power_on()
 
@@ -69,6 +78,7 @@ class Machine:
         self.trigger_enabled = False
         self.underrun = False
         self.free_bytes = 0
+        self.busy_s = 0.0  # how much longer the last command takes
 
     def advance(self, now_s: float) -> None:
         """Do everything that is due, in time's order."""
@@ -172,8 +182,7 @@ class Machine:
         if command & r.M2CMD_DATA_STARTDMA:
             self._start_dma(now_s)
         if command & r.M2CMD_CARD_START:
-            self._start()
-            self._write_setup(now_s)
+            self._start(now_s)
         if command & r.M2CMD_CARD_ENABLETRIGGER:
             self.trigger_enabled = self.running
         if command & r.M2CMD_CARD_FORCETRIGGER:
@@ -183,9 +192,11 @@ class Machine:
 
     def _write_setup(self, now_s: float) -> None:
         """The set-up is written to the card: its relays follow the registers."""
-        self.setup.write_to_card()
+        if self.setup.write_to_card():
+            self.busy_s = PLL_LOCK_S
         for register, channel in OUTPUTS.items():
-            self.amplifiers[channel].enable(bool(self.setup[register]), now_s)
+            if channel < self.model.n_channels:
+                self.amplifiers[channel].enable(bool(self.setup[register]), now_s)
 
     def _reset(self, now_s: float) -> None:
         """Everything as after power-on, outputs off."""
@@ -196,9 +207,10 @@ class Machine:
             amplifier.set_amplitude(1000, now_s)
         self._power_on()
 
-    def _start(self) -> None:
+    def _start(self, now_s: float) -> None:
         if self.running:
             raise Refusal(r.ERR_SEQUENCE, "the card runs already")
+        self._write_setup(now_s)
         setup = self.setup
         n_samples, n_channels, loops = setup[r.SPC_MEMSIZE], len(setup.channels), setup[r.SPC_LOOPS]
         if setup.mode == r.SPC_REP_STD_SINGLE:

@@ -8,23 +8,33 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from labseq.plugin import DeviceError
 from labseq_spcm_sim.card import SimulatedCard
 from labseq_spcm_sim.faults import COPY_BYTES_PER_S, MANUAL_SPEEDS, Faults
-from labseq_spcm_sim.setup import M4I6631, CardModel
+from labseq_spcm_sim.setup import M4I6631, MODELS, CardModel
 
 NewCard = Callable[..., SimulatedCard]
 
 
-def card_with(faults: Mapping[str, Any]) -> NewCard:
-    """What makes simulated cards for the settings ``faults`` of the driver.
+def card_with(faults: Mapping[str, Any], model: str = "") -> NewCard:
+    """What makes simulated cards for the settings of the driver.
+
+    Args:
+        faults: Its section ``faults``.
+        model: Name of a model; "": an M4i.6631-x8.
 
     Raises:
         ConfigError: The file of a first contact is missing, or was edited.
+        DeviceError: There is no simulator of this model.
     """
     if (path := faults["first_contact"]) is not None:
         return measured_card(Path(path))
+    if model and model not in MODELS:
+        text = f"there is no simulated {model}; expected one of {', '.join(MODELS)}"
+        raise DeviceError("spcm simulator", f"{text}, or no `model`")
     return partial(
         SimulatedCard,
+        model=MODELS.get(model, M4I6631),
         faults=Faults(
             copies_samples=faults["copies_samples"],
             position_lag_s=faults["position_lag"],
@@ -59,7 +69,7 @@ def _model(name: str, identity: Mapping[str, Any]) -> CardModel:
     low_hz, high_hz = M4I6631.sample_rate_hz
     low_mv, high_mv = M4I6631.amplitude_mv
     return replace(
-        M4I6631,
+        MODELS.get(name, M4I6631),
         name=name,
         card_type=told.get("card_type", M4I6631.card_type),
         memory_samples=told.get("memory_bytes", 2 * M4I6631.memory_samples) // 2,

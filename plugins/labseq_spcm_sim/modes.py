@@ -247,8 +247,9 @@ class Fifo:
 
     def hand_over(self, n_bytes: int) -> None:
         """The user has filled bytes, which the card may now fetch."""
-        if not 0 <= n_bytes <= self.user_bytes:
-            raise refuse(n_bytes, f"0 to {self.user_bytes} bytes")
+        room = self.user_bytes + max(0, self._buffer.n_bytes - self.handed)
+        if not 0 <= n_bytes <= room:
+            raise refuse(n_bytes, f"0 to {room} bytes")
         if n_bytes % self._frame:
             raise refuse(n_bytes, f"a multiple of {self._frame} bytes")
         self.handed += n_bytes
@@ -266,10 +267,13 @@ class Fifo:
 
     @property
     def user_bytes(self) -> int:
-        """Bytes that are free for the user, in whole notify sizes, as far as the card has reported it."""
+        """Bytes that are free for the user, in whole notify sizes, as far as the card has reported it.
+
+        A new buffer counts as full (manual, "Buffer handling"): none are free until some were fetched.
+        """
         fetched = math.floor(self._reported.at(self._now_s) + ROUNDING_BYTES)
         notified = fetched - fetched % max(1, self._buffer.notify_bytes)
-        return self._buffer.n_bytes - (self.handed - notified)
+        return notified - max(0, self.handed - self._buffer.n_bytes)
 
     @property
     def levels(self) -> tuple[float, float]:
@@ -279,7 +283,8 @@ class Fifo:
     @property
     def block_ready(self) -> bool:
         """Whether there is room for a block, or all was transferred."""
-        return self.user_bytes >= max(1, self._buffer.notify_bytes) or self.fetched >= self.handed
+        is_done = 0 < self.handed <= self.fetched
+        return self.user_bytes >= max(1, self._buffer.notify_bytes) or is_done
 
     def advance(self, now_s: float) -> None:
         """Let bytes flow up to now."""

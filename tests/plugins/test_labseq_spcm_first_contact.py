@@ -43,7 +43,7 @@ class Lab:
                 results[step.name] = dict(step.run())
                 self.contact.safe_state()
                 assert not self.card.running
-                assert self.card.outputs_on == (False, False)
+                assert not any(self.card.outputs_on)
         return results
 
     def spans(self) -> list[SampleSpan]:
@@ -82,7 +82,7 @@ UNSEEN = "not measured: overwrite"
         (Faults(), ""),
         (Faults(copies_samples=True), "samples are copied when they are handed over, at 8 GB/s"),
         (Faults(position_lag_s=131e-6), "late, longer than a block"),
-        (Faults(fifo_short_bytes=4096), "the card's buffer takes 4096 bytes less than its size, 65536"),
+        (Faults(fifo_short_bytes=4096), "the card's buffer takes 4096 bytes less than its size, 131072"),
         (Faults(pinning_s=1e-3), "naming a transfer buffer takes 1 ms"),
         (Faults(underrun_not_ready=True), "sets OVERRUN (0x400) and not READY"),
         (Faults(write_speeds=MANUAL_SPEEDS), "blocks of 64 KiB are written at 0.464 GB/s"),
