@@ -13,7 +13,16 @@ import pytest
 from labseq_spcm.first_contact import SpcmFirstContact
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm_sim import M4I6631, CardModel, Faults, SampleSpan, SimulatedCard, card_with, installed
+from labseq_spcm_sim import (
+    M4I6631,
+    CardModel,
+    Faults,
+    SampleSpan,
+    SimulatedCard,
+    card_with,
+    installed,
+    setup,
+)
 from labseq_spcm_sim.faults import MANUAL_SPEEDS
 
 from labseq.drivers.first_contact import write_contact
@@ -111,6 +120,37 @@ def test_write_speed_is_that_of_the_bus_also_from_the_continuous_buffer() -> Non
         speeds = lab.take("write_speed")["write_speed"]
     assert dict(speeds["user"]) == pytest.approx(dict(MANUAL_SPEEDS), rel=0.01)
     assert [speed for _, speed in speeds["continuous"]] == pytest.approx([2549e6] * 5, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("reference_hz", "named"), [(10e6, "and not the sample_rate, 624 MHz"), (0.0, "not lock")]
+)
+def test_rates_from_a_reference_are_those_that_the_card_makes(reference_hz: float, named: str) -> None:
+    model = replace(M4I6631, reference_hz=reference_hz, reference_divider=1)
+    with met(with_faults(model=model), reference_clock="10 MHz") as lab:
+        result = lab.take("reference")["reference"]
+        verdict = lab.contact.judge({"reference": result})
+    made = {asked: actual for asked, actual, _ in result["rates"]}
+    assert made[620_000_000] == (620_000_000 if reference_hz else 0)
+    assert made[624_000_000] != 624_000_000
+    assert named in verdict["reason"]
+
+
+def test_the_option_dds_is_read_where_the_card_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With figures that others read from an M4i.9622."""
+    with met() as lab:
+        spcm = lab.contact._bench.card.spcm
+        assert "no licence of the option DDS" in lab.take("dds")["dds"]["skipped"]
+        option: dict[int, Any] = {
+            spcm.SPC_PCIEXTFEATURES: spcm.SPCM_FEAT_EXTFW_DDS20,
+            spcm.SPC_DDS_NUM_CORES: 23,
+            spcm.SPC_DDS_AVAIL_FREQ_SLOPE_STEP: 2775.5,
+        }
+        monkeypatch.setitem(setup._RULES, spcm.SPC_CARDMODE, lambda _setup, value: value)
+        lab.card._identity.update(option)
+        facts = lab.take("dds")["dds"]
+    assert (facts["cores"], facts["frequency_slope_step_hz_per_s"]) == (23, 2775.5)
+    assert facts["amplitude_slope_step_per_s"] is None, "this card does not tell"
 
 
 class TestScope:
