@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,8 +32,10 @@ from labseq.drivers.first_contact import write_contact
 from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError
 from labseq.testing.fakes import FakeClock
 
-from .card_process import TweezersOfProcess
+from .card_process import PLUGIN, TweezersOfProcess
 from .card_process_emergency import Connection
+from .labseq_soapy_rig import until
+from .small_run import write
 
 RATE_HZ = 624e6
 BLOCK_S = 65536 / 4 / RATE_HZ
@@ -310,3 +315,31 @@ def test_another_model_and_a_card_in_use_are_refused() -> None:
         other = SpcmMobileTweezers(settings, context).first_contact()
         with pytest.raises(DeviceError, match=r"in use; .*close what else uses it"):
             other.open()
+
+
+def test_the_command_that_is_killed_while_an_output_is_on_leaves_the_card_off(
+    outliving: str, tmp_path: Path
+) -> None:
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "card.py").write_text(PLUGIN, encoding="utf-8")
+    card = f"{{use: spcm_process, card: 'simulated@{outliving}', sample_rate: {RATE_HZ / 1e6:g} MHz}}"
+    write(tmp_path, mobile=card)
+    with (tmp_path / "p.yaml").open("a", encoding="utf-8") as profile:
+        profile.write("plugin_folders: [plugins]\n")
+    step = ["--yes", "--with", "scope", "--step", "relay_steps"]
+    command = [sys.executable, "-m", "labseq", "first-contact", "./p.yaml", "mobile_tweezers", *step]
+    place = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    with subprocess.Popen(command, cwd=tmp_path, env=place, stdin=subprocess.DEVNULL) as process:
+        instrument: list[Connection] = []
+
+        def outputs_on() -> bool:
+            with suppress(OSError, ValueError):
+                instrument[:] = instrument or [Connection(outliving)]
+            return bool(instrument) and instrument[0]("state")[1] == (True, True)
+
+        until(outputs_on, 120.0)
+        process.kill()
+    until(lambda: not outputs_on())
+    assert instrument[0]("state") == (False, (False, False))
+    instrument[0].close()
+    assert not (tmp_path / "data").exists(), "nothing was measured"
