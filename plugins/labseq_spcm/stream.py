@@ -443,7 +443,7 @@ class Stream(PlayMode):
             played = max(0, min(fetched, made) - start) / (end - start)
             length = format_quantity((end - start) / self._rate_hz, "time")
             share = f"{played:.0%} of a part of {length} was played"
-            was_full = made - start >= len(self._ring) - self._ahead
+            was_full = made - start >= len(self._ring) - self._ahead - self._on_card
             remedy = (
                 f"raise `{'fill' if was_full else 'look_ahead'}`, lower sample_rate, or use the mode replay"
             )

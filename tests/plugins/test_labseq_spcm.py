@@ -124,7 +124,7 @@ def test_the_relays_close_once_and_settle_before_a_program(driver: Any, mode: st
         closed_s = lab.clock.now()
         lab.tweezers.settle()
         settled_s = lab.clock.now()
-        assert settled_s - closed_s == M4I6631.output_relay_s
+        assert settled_s - closed_s == pytest.approx(M4I6631.output_relay_s)
         assert lab.card.outputs_on == (True, True)
         lab.card.log.clear()
         for _ in range(2):
