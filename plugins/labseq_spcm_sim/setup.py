@@ -63,6 +63,10 @@ OUTPUT_FIFO_BYTES: Final = 192 * 1024
 MEMORY_STEP: Final = 32
 """Step and minimum of the memory size, in samples per channel."""
 MAX_LOOPS: Final = 2**32 - 1
+MAX_SEGMENTS: Final = 1 << 16
+MAX_STEPS: Final = 4096
+MAX_LOOPS_OF_STEP: Final = (1 << 20) - 1
+"""Of the sequence mode."""
 
 
 def trigger_delay_s(sample_rate_hz: float) -> float:
@@ -245,7 +249,7 @@ _SWITCH: Final = one_of(0, 1)
 _STOP_LEVEL: Final = one_of(
     r.SPCM_STOPLVL_ZERO, r.SPCM_STOPLVL_LOW, r.SPCM_STOPLVL_HIGH, r.SPCM_STOPLVL_HOLDLAST
 )
-_MODES: Final = (r.SPC_REP_STD_SINGLE, r.SPC_REP_FIFO_SINGLE)
+_MODES: Final = (r.SPC_REP_STD_SINGLE, r.SPC_REP_FIFO_SINGLE, r.SPC_REP_STD_SEQUENCE)
 
 _SETTINGS: Final[dict[int, tuple[Rule, Number]]] = {
     r.SPC_TIMEOUT: (within(0, 2**31 - 1), 0),
@@ -284,7 +288,7 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_PCITYP: model.card_type,
         r.SPC_FNCTYPE: r.SPCM_TYPE_AO,
         r.SPC_PCIMEMSIZE: 2 * model.memory_samples,
-        r.SPC_PCIFEATURES: 0,
+        r.SPC_PCIFEATURES: r.SPCM_FEAT_SEQUENCE,
         r.SPC_PCIEXTFEATURES: r.SPCM_FEAT_EXTFW_AWG,
         r.SPC_MIINST_MODULES: 1,
         r.SPC_MIINST_CHPERMODULE: 2,
@@ -304,4 +308,8 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_AVAILMEMSIZE_MIN: MEMORY_STEP,
         r.SPC_AVAILMEMSIZE_MAX: model.memory_samples,
         r.SPC_AVAILMEMSIZE_STEP: MEMORY_STEP,
+        r.SPC_SEQMODE_AVAILMAXSEGMENT: MAX_SEGMENTS,
+        r.SPC_SEQMODE_AVAILMAXSTEPS: MAX_STEPS,
+        r.SPC_SEQMODE_AVAILMAXLOOP: MAX_LOOPS_OF_STEP,
+        r.SPC_SEQMODE_AVAILFEATURES: r.SPCSEQ_ENDLOOPONTRIG | r.SPCSEQ_END,
     }
