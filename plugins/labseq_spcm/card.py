@@ -175,13 +175,25 @@ class AwgCard:
         Raises:
             DeviceTimeoutError: They take too long.
         """
+        self.begin_upload(frames)
+        self.finish_upload(frames.nbytes, poll_s)
+
+    def begin_upload(self, frames: NDArray[np.int16]) -> None:
+        """Begin to transfer samples to the on-board memory; the array must live until they have arrived."""
         self.define_transfer(frames)
         self.command(self.spcm.M2CMD_DATA_STARTDMA, "upload")
-        limit_s = frames.nbytes / 0.5e9 + TRANSFER_TIMEOUT_S  # every slot for the card reaches 0.5 GB/s
+
+    def finish_upload(self, n_bytes: int, poll_s: float) -> None:
+        """Wait until all has arrived.
+
+        Raises:
+            DeviceTimeoutError: It takes too long.
+        """
+        limit_s = n_bytes / 0.5e9 + TRANSFER_TIMEOUT_S  # every slot for the card reaches 0.5 GB/s
         deadline_s = self.clock.now() + limit_s
         while not self.status & self.spcm.M2STAT_DATA_END:
             if self.clock.now() > deadline_s:
-                raise DeviceTimeoutError(self.name, f"{frames.nbytes} bytes were not uploaded", limit_s)
+                raise DeviceTimeoutError(self.name, f"{n_bytes} bytes were not uploaded", limit_s)
             self.clock.sleep(poll_s)
 
     def stop(self) -> None:

@@ -9,7 +9,7 @@ from pydantic import Field, field_validator, model_validator
 from labseq.plugin import Duration, Frequency, Settings, Voltage, format_quantity
 from labseq_spcm import limits
 
-Mode: TypeAlias = Literal["replay", "fifo", "stream"]
+Mode: TypeAlias = Literal["replay", "sequence", "fifo", "stream"]
 Channel: TypeAlias = Literal[0, 1]
 
 NO_TRIGGER: Final = (
@@ -40,7 +40,8 @@ class SpcmSettings(Settings):
     serial: int = Field(default=0, ge=0, description="serial number that the card must have; 0: any")
     mode: Mode = Field(
         default="replay",
-        description="replay: uploaded whole, then played; fifo: streamed while it is being rendered; "
+        description="replay: uploaded whole, then played; sequence: uploaded in parts into the card's memory "
+        "while the card plays a loop, which then leads to them; fifo: streamed while it is being rendered; "
         "stream: the same, spliced into silence that the card plays all the time",
     )
     sample_rate: Frequency = Field(
@@ -91,7 +92,7 @@ class SpcmSettings(Settings):
         description="stream: bytes of on-board memory that are used, a power of two, at least notify_size",
     )
     keep_warm: KeepWarmSettings | None = Field(
-        default=None, description="stream: tones off the atoms between programs; none: silence"
+        default=None, description="sequence and stream: tones off the atoms between programs; none: silence"
     )
 
     @field_validator("sample_rate")
@@ -130,12 +131,12 @@ class SpcmSettings(Settings):
 
     @model_validator(mode="after")
     def _check_stream(self) -> Self:
+        if self.keep_warm is not None and self.mode not in ("sequence", "stream"):
+            raise ValueError(
+                f"keep_warm is set, but mode: {self.mode} leaves the AODs dark while it uploads "
+                "programs; use mode: sequence, or leave keep_warm out"
+            )
         if self.mode != "stream":
-            if self.keep_warm is not None:
-                raise ValueError(
-                    f"keep_warm is set, but mode: {self.mode} leaves the AODs dark while it uploads "
-                    "programs; use mode: stream, or leave keep_warm out"
-                )
             return self
         if self.trigger == "external":
             raise ValueError(f"mode: stream {NO_TRIGGER}")
@@ -159,7 +160,7 @@ class SpcmSettings(Settings):
     @property
     def overhead_per_cycle_s(self) -> float:
         """Time from a cycle's plan to its light: measured, see the timing budget."""
-        return {"replay": 20e-3, "fifo": 17e-3, "stream": 3e-3}[self.mode]
+        return {"replay": 20e-3, "sequence": 5e-3, "fifo": 17e-3, "stream": 3e-3}[self.mode]
 
     @property
     def fill_s(self) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from labseq_spcm.keep_warm import KeepWarm
 from labseq_spcm.mobile_tweezers import HOT_C, TEST_SAMPLES, SpcmMobileTweezers
+from labseq_spcm.play_sequence import SILENT_SAMPLES
 from labseq_spcm.replay_fifo import CHUNK, InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import M4I6631, SimulatedCard, SimulatedLibrary, installed, registers
@@ -36,14 +37,20 @@ from labseq.testing.fakes import FakeClock
 
 from .conftest import RATE_HZ
 
-MODES = ["replay", "fifo", "stream"]
-TRIGGERED = ["replay", "fifo"]
+MODES = ["replay", "sequence", "fifo", "stream"]
+TRIGGERED = ["replay", "sequence", "fifo"]
 
 
 class TestReplayContract(MobileTweezersContract):
     @pytest.fixture
     def factory(self) -> Callable[[Context], SpcmMobileTweezers]:
         return partial(SpcmMobileTweezers, SpcmSettings(card="simulated"))
+
+
+class TestSequenceContract(MobileTweezersContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], SpcmMobileTweezers]:
+        return partial(SpcmMobileTweezers, SpcmSettings(card="simulated", mode="sequence"))
 
 
 class TestFifoContract(MobileTweezersContract):
@@ -59,7 +66,7 @@ class TestStreamContract(MobileTweezersContract):
 
 
 class TestSamples:
-    @pytest.mark.parametrize(("mode", "row_channel"), [("replay", 0), ("fifo", 1)])
+    @pytest.mark.parametrize(("mode", "row_channel"), [("replay", 0), ("sequence", 0), ("fifo", 1)])
     def test_are_what_was_rendered_and_then_silence(self, driver: Any, mode: str, row_channel: int) -> None:
         motion = MotionSpec(rf=RfSpec(full_scale_v=0.2))
         outputs = {"row_channel": row_channel}
@@ -84,7 +91,8 @@ class TestPlaying:
         with driver(mode) as lab:
             program = lab.program(3)
             delay_s = float(lab.tweezers.describe()["trigger_delay_s"])
-            assert 0.1e-6 < delay_s < (500e-6 if mode == "stream" else 10e-6)
+            most_s = {"stream": 500e-6, "sequence": 110e-6}.get(mode, 10e-6)
+            assert 0.1e-6 < delay_s < most_s
             assert lab.tweezers.prepare(program) == pytest.approx(
                 program.total_duration_s + delay_s, abs=1.5 / lab.rate_hz * 32
             )
@@ -115,7 +123,8 @@ class TestPlaying:
             lab.tweezers.wait(duration_s + 1e-3)
             begun_s = lab.card.played(0)[0].start_s
             delay_s = float(lab.tweezers.describe()["trigger_delay_s"])
-            assert begun_s - triggered_s == pytest.approx(delay_s, abs=1e-9)
+            loop_s = SILENT_SAMPLES / lab.rate_hz if mode == "sequence" else 1e-9
+            assert -1e-9 < triggered_s + delay_s - begun_s < loop_s
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -341,6 +350,8 @@ def test_a_card_that_is_well_passes_and_stays_silent(driver: Any, mode: str) -> 
         lab.tweezers.self_test()
         assert not lab.card.running
         assert not lab.card.played(0)
+        if mode == "sequence":
+            assert not lab.card._machine.memory.segments[1].any()
         if mode == "replay":
             assert lab.card.memory.shape == (TEST_SAMPLES, 2)
             assert not lab.card.memory.any()

@@ -33,8 +33,8 @@ from labseq.testing.fakes import FakeClock
 
 from .small_run import run
 
-MODES = ["replay", "fifo", "stream"]
-TRIGGERED = ["replay", "fifo"]
+MODES = ["replay", "sequence", "fifo", "stream"]
+TRIGGERED = ["replay", "sequence", "fifo"]
 
 
 def context(motion: MotionSpec | None = None) -> Context:
@@ -420,7 +420,7 @@ class Calls(RuleBasedStateMachine):
         self.stack = ExitStack()
         self.lab = self.stack.enter_context(driver(mode, trigger=trigger, fill=1e-3))
         self.is_open = self.safe = self.idle = True
-        self.streams = mode == "stream"
+        self.streams = mode in ("sequence", "stream")  # it plays silence between programs
 
     @rule(n_batches=st.sampled_from([1, 2, 24]))
     def prepare(self, n_batches: int) -> None:
