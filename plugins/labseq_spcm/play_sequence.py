@@ -30,13 +30,11 @@ SILENT_SAMPLES: Final = 1024
 """Length of the idle segment: a program begins at its end, 1.6 us later at most at 624 MS/s."""
 WARM_SAMPLES: Final = 16384
 """The same with keep-warm tones, whose frequencies are multiples of the sample rate over this length."""
-LEAST_SAMPLES: Final = 192
-"""Least size of a segment with two channels."""
 SEGMENT_SAMPLES: Final = 1 << 20
 """Least room for samples in a segment, in a memory that can be divided accordingly."""
 BEGINNING_S: Final = 1e-3
 """A program is cut after that time."""
-POLL_S: Final = 50e-6
+POLL_S: Final = 20e-6
 """Time between two reads of the status while samples are transferred."""
 
 
@@ -149,7 +147,7 @@ class SequenceReplay(PlayMode):
         self._first = 0 if self._waiting >= self._n_steps // 2 else self._n_steps // 2
         self._n_parts = 0
         renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
-        n_samples = max(LEAST_SAMPLES, renderer.n_samples)
+        n_samples = renderer.n_samples
         self._upload(renderer, self._split([n_samples], self._part_size(n_samples, 1)))
         return n_samples / self._rate_hz
 
@@ -166,7 +164,7 @@ class SequenceReplay(PlayMode):
     def append(self, program: ToneProgram) -> float:
         """Have the rest of a program follow, each part when it has arrived; returns its playing time, s."""
         renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
-        n_samples = max(LEAST_SAMPLES, renderer.n_samples)
+        n_samples = renderer.n_samples
         size = self._part_size(n_samples, 2)  # a batch may fill its last segment in part only
         ends = [0]
         for joint in silent_joints(program, renderer.first_sample).tolist():
@@ -214,7 +212,7 @@ class SequenceReplay(PlayMode):
     def _split(self, ends: Sequence[int], size: int) -> Iterator[Part]:
         """Split what is linked at once, and ends at these samples, into parts of about equal size."""
         for start, end in itertools.pairwise([0, *ends]):
-            n, first = math.ceil((end - start) / size), self._n_parts
+            n, first = max(1, round((end - start) / size), -(-(end - start) // self._room)), self._n_parts
             stops = [start + math.ceil((end - start) * i / n / SAMPLE_STEP) * SAMPLE_STEP for i in range(n)]
             for part_start, stop in itertools.pairwise([*stops, end]):
                 yield Part(self._n_parts, part_start, stop, first, stop == end)

@@ -182,12 +182,13 @@ def _shot(lab: Any) -> tuple[float, float, float]:
 
 
 class TestKeepWarm:
-    def test_holds_the_mean_power_over_a_shot(self, driver: Any) -> None:
-        with driver("stream") as lab:
+    @pytest.mark.parametrize("mode", ["sequence", "stream"])
+    def test_holds_the_mean_power_over_a_shot(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab:
             start_s, end_s, busy = _shot(lab)
             assert busy < 0.2
             silent = [_power_w(lab, channel, start_s, end_s) for channel in (0, 1)]
-        with driver("stream", keep_warm=PARKED) as lab:
+        with driver(mode, keep_warm=PARKED) as lab:
             n_tones = lab.motion.max_row_tones, lab.motion.max_column_tones
             assert _power_w(lab, 0, lab.clock.now() - 1e-3, lab.clock.now()) == 0
             start_s, end_s, busy = _shot(lab)
@@ -223,13 +224,14 @@ class TestKeepWarm:
             SpcmMobileTweezers(settings, Context("mobile_tweezers", motion=motion))
         assert refused.value.setting == ("keep_warm", key)
 
+    @pytest.mark.parametrize("mode", ["sequence", "stream"])
     @pytest.mark.parametrize("row_hz", [82.2e6, 84.8e6])
-    def test_reaches_the_virtual_atoms_only_if_it_is_on_them(self, row_hz: float) -> None:
+    def test_reaches_the_virtual_atoms_only_if_it_is_on_them(self, row_hz: float, mode: str) -> None:
         tones = KeepWarm((row_hz, 84.8e6), (0.3, 0.3))
         clock, grid = FakeClock(), Context().grid
         card = SimulatedCard(clock)
         with installed(card) as name:
-            settings = SpcmSettings(card=name, mode="stream", sample_rate=RATE_HZ)
+            settings = SpcmSettings.model_validate({"card": name, "mode": mode, "sample_rate": RATE_HZ})
             tweezers = SpcmMobileTweezers(settings, Context("mobile_tweezers", clock=clock))
             tweezers._keep_warm = tones
             tweezers.open()
@@ -242,7 +244,7 @@ class TestKeepWarm:
             assert row.amplitude_v == pytest.approx([0.3 * 1.6], rel=1e-3)
             lit = [active_spans(spans[0], limits) for spans, limits in zip(source, reach, strict=True)]
             assert [bool(spans) for spans in lit] == [row_hz > 84e6, True]
-            clock.sleep(20e-6)  # less than a block of the stream
+            clock.sleep(20e-6)  # less than a block of the stream, and than the idle segment
             later = CardOutputs(card, 0)
             later.played(clock.now() - 10e-6)
             assert all(isinstance(span, RfTones) for spans in later.played(clock.now()) for span in spans)

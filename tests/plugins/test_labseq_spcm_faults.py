@@ -21,6 +21,7 @@ from hypothesis.stateful import (
 )
 from labseq_spcm.library import VendorLibrary, load_spcm
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.play_sequence import SequenceReplay
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm.stream import Stream
@@ -79,7 +80,7 @@ class TestCards:
             lab.play(lab.program())
 
 
-@pytest.mark.parametrize(("mode", "timeout_s"), [("replay", 0.0), ("fifo", 50e-3)])
+@pytest.mark.parametrize(("mode", "timeout_s"), [("replay", 0.0), ("sequence", 0.0), ("fifo", 50e-3)])
 def test_a_trigger_that_never_comes_times_out_into_the_safe_state(
     driver: Any, mode: str, timeout_s: float
 ) -> None:
@@ -93,7 +94,10 @@ def test_a_trigger_that_never_comes_times_out_into_the_safe_state(
         lab.tweezers.prepare(lab.program())
 
 
-@pytest.mark.parametrize(("mode", "player"), [("replay", Replay), ("fifo", Fifo), ("stream", Stream)])
+@pytest.mark.parametrize(
+    ("mode", "player"),
+    [("replay", Replay), ("sequence", SequenceReplay), ("fifo", Fifo), ("stream", Stream)],
+)
 def test_a_wait_during_which_another_thread_makes_the_card_safe_is_no_end_of_the_program(
     driver: Any, mode: str, player: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
