@@ -248,7 +248,8 @@ def test_closing_goes_through_even_if_the_card_is_broken(driver: Any) -> None:
 @pytest.mark.parametrize(
     "mobile",
     [
-        "{use: spcm, card: simulated, sample_rate: 250 MHz}",
+        "{use: spcm, card: simulated, mode: replay, sample_rate: 250 MHz}",
+        "{use: spcm, card: simulated, mode: sequence, sample_rate: 250 MHz}",
         "{use: spcm, card: simulated, mode: fifo, sample_rate: 250 MHz}",
     ],
 )
@@ -274,6 +275,7 @@ LINE = (
 )
 
 
+@pytest.mark.parametrize("mode", ["replay", "sequence"])
 @pytest.mark.parametrize(
     ("n_edges", "text"),
     [
@@ -282,7 +284,7 @@ LINE = (
     ],
 )
 def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
-    tmp_path: Path, n_edges: int, text: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, n_edges: int, text: str, mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cards: list[Any] = []
     play = SpcmMobileTweezers.play
@@ -299,7 +301,7 @@ def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
     if n_edges == 0:
         monkeypatch.setattr(SimulatedCard, "trigger_at", lambda *_: None)
     with pytest.raises(DeviceError, match=text) as raised:
-        run(tmp_path, mobile=f"{{use: spcm, card: simulated, sample_rate: 250 MHz}}{LINE}")
+        run(tmp_path, mobile=f"{{use: spcm, card: simulated, mode: {mode}, sample_rate: 250 MHz}}{LINE}")
     assert (raised.value.device, raised.value.exit_code) == ("mobile_tweezers", 3)
     assert (cards[0].running, cards[0].outputs_on) == (False, (False, False))
 
