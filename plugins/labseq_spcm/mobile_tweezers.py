@@ -128,9 +128,7 @@ class SpcmMobileTweezers(MobileTweezers):
         return math.inf if self._mode is None else self._mode.beginning_s
 
     def warnings(self) -> list[str]:
-        """The sample rate of a stream, if another one is rendered several times faster."""
-        if self._settings.mode != "stream":
-            return []
+        """The sample rate, if another one is rendered several times faster."""
         rate_hz = self._settings.sample_rate
         try:
             best_hz = comb_sample_rate(self._context.grid, rate_hz)
@@ -139,9 +137,9 @@ class SpcmMobileTweezers(MobileTweezers):
         if best_hz == rate_hz:
             return []
         rate, best = (format_quantity(hz, "frequency") for hz in (rate_hz, best_hz))
-        what = f"profile.{self._name}.sample_rate is {rate}; its samples take three times as long to render"
-        why = f"as those at {best}, a whole number per tone spacing: too long for most computers"
-        return [f"{what} {why}; set sample_rate: {best}, or use another mode than stream"]
+        what = f"profile.{self._name}.sample_rate is {rate}; its samples take up to three times as long"
+        why = f"to render as those at {best}, a whole number per tone spacing"
+        return [f"{what} {why}; set sample_rate: {best}"]
 
     def warm(self) -> None:
         """Import the vendor's package, and compile the kernels of the mode or load them from the cache.

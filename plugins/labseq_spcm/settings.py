@@ -9,12 +9,10 @@ from pydantic import Field, field_validator, model_validator
 from labseq.plugin import Duration, Frequency, Settings, Voltage, format_quantity
 from labseq_spcm import limits
 
-Mode: TypeAlias = Literal["replay", "sequence", "fifo", "stream"]
+Mode: TypeAlias = Literal["sequence", "replay", "fifo", "stream"]
 Channel: TypeAlias = Literal[0, 1]
 
-NO_TRIGGER: Final = (
-    "takes no external trigger, because the card runs all the time; leave the trigger out, or use mode: fifo"
-)
+NO_TRIGGER: Final = "takes no external trigger: a stream waits for nothing; use mode: sequence for it"
 
 
 class KeepWarmSettings(Settings):
@@ -39,9 +37,9 @@ class SpcmSettings(Settings):
     )
     serial: int = Field(default=0, ge=0, description="serial number that the card must have; 0: any")
     mode: Mode = Field(
-        default="replay",
-        description="replay: uploaded whole, then played; sequence: uploaded in parts into the card's memory "
-        "while the card plays a loop, which then leads to them; fifo: streamed while it is being rendered; "
+        default="sequence",
+        description="sequence: uploaded in parts beside a loop that plays, which then leads to them; "
+        "replay: uploaded whole, then played; fifo: streamed while it is being rendered; "
         "stream: the same, spliced into silence that the card plays all the time",
     )
     sample_rate: Frequency = Field(
@@ -118,7 +116,7 @@ class SpcmSettings(Settings):
             rate, most = _hz(self.sample_rate), _hz(limits.FIFO_RATE_HZ)
             raise ValueError(
                 f"sample_rate is {rate}, but the bus carries at most {most} on two channels; lower it, or "
-                "use mode: replay"
+                "use mode: sequence"
             )
         return self
 

@@ -44,7 +44,7 @@ TRIGGERED = ["replay", "sequence", "fifo"]
 class TestReplayContract(MobileTweezersContract):
     @pytest.fixture
     def factory(self) -> Callable[[Context], SpcmMobileTweezers]:
-        return partial(SpcmMobileTweezers, SpcmSettings(card="simulated"))
+        return partial(SpcmMobileTweezers, SpcmSettings(card="simulated", mode="replay"))
 
 
 class TestSequenceContract(MobileTweezersContract):
@@ -388,7 +388,7 @@ def test_a_clock_that_another_program_has_changed_is_reported(driver: Any) -> No
 
 def test_the_simulated_card_of_a_profile_keeps_only_the_last_program() -> None:
     clock = FakeClock()
-    tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated"), Context(clock=clock))
+    tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated", mode="replay"), Context(clock=clock))
     tweezers.open()
     assert isinstance(tweezers.library, SimulatedLibrary)
     card = tweezers.library.card
@@ -403,3 +403,12 @@ def test_the_simulated_card_of_a_profile_keeps_only_the_last_program() -> None:
         assert [span.start_s > starts_s[-1] for span in card.played(0)] == [True]
     tweezers.close()
     assert tweezers.library.card is None
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_rate_that_is_slow_to_render_is_reported_before_a_run(mode: str) -> None:
+    for rate_hz, n_warnings in ((624e6, 0), (625e6, 1)):
+        settings = SpcmSettings.model_validate({"card": "simulated", "mode": mode, "sample_rate": rate_hz})
+        warnings = SpcmMobileTweezers(settings, Context()).warnings()
+        assert len(warnings) == n_warnings
+        assert all("set sample_rate: 624 MHz" in text for text in warnings)

@@ -321,7 +321,7 @@ def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
         ("mode: stream, card_buffer: 8192", 2, "at least notify_size, 65536"),
         (f"mode: stream}}{LINE[:-1]}", 2, "a line triggers it, but mode: stream"),
         (
-            "keep_warm: {row_frequency: 82 MHz, column_frequency: 118 MHz}",
+            "mode: replay, keep_warm: {row_frequency: 82 MHz, column_frequency: 118 MHz}",
             2,
             "keep_warm is set, but mode: replay leaves the AODs dark",
         ),

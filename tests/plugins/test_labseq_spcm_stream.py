@@ -344,13 +344,3 @@ def test_in_real_time_a_thread_feeds_the_card_until_it_is_safe() -> None:
                 assert (card.running, card.outputs_on) == (False, (False, False))
         finally:
             tweezers.close()
-
-
-@pytest.mark.parametrize(("rate_hz", "warned"), [(624e6, 0), (625e6, 1)])
-def test_a_rate_that_is_slow_to_render_is_reported_before_a_run(
-    driver: Any, rate_hz: float, warned: int
-) -> None:
-    with driver("stream", sample_rate=rate_hz) as lab:
-        warnings = lab.tweezers.warnings()
-        assert len(warnings) == warned
-        assert all("set sample_rate: 624 MHz" in text for text in warnings)
