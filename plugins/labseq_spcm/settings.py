@@ -158,7 +158,7 @@ class SpcmSettings(Settings):
     @property
     def overhead_per_cycle_s(self) -> float:
         """Time from a cycle's plan to its light: measured, see the timing budget."""
-        return {"replay": 20e-3, "sequence": 5e-3, "fifo": 17e-3, "stream": 3e-3}[self.mode]
+        return {"replay": 20e-3, "sequence": 6e-3, "fifo": 17e-3, "stream": 3e-3}[self.mode]
 
     @property
     def fill_s(self) -> float:
