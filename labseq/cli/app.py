@@ -107,6 +107,12 @@ Examples:
   labseq export data/2026-11-20/0001_compact-225 --to netcdf -o compact.nc
   labseq export data/2026-11-20/0001_compact-225 --to archive --frames
 """
+CONTACT_EXAMPLES: Final = """\b
+Examples:
+  labseq first-contact mylab mobile_tweezers
+  labseq first-contact mylab mobile_tweezers --with scope --step overwrite
+  labseq first-contact bench_awg --yes
+"""
 DOCTOR_EXAMPLES: Final = """\b
 Examples:
   labseq doctor --dry-run
@@ -587,3 +593,49 @@ def devices(
     from labseq.cli.devices import show_devices
 
     raise typer.Exit(show_devices(profile, overrides or (), dry_run_mode(dry_run), as_json=as_json))
+
+
+@app.command(epilog=CONTACT_EXAMPLES, short_help="Prove on a new device what its driver assumes.")
+def first_contact(
+    profile: ProfileArgument,
+    role: Annotated[
+        str,
+        typer.Argument(
+            metavar="ROLE", help="The device, such as mobile_tweezers; default: every device in turn."
+        ),
+    ] = "",
+    steps: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--step",
+            metavar="NAME",
+            help="Take only this step, and keep the earlier results of the others; may be repeated.",
+        ),
+    ] = None,
+    instruments: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with",
+            metavar="scope|reference",
+            help="What is connected, instead of being asked: an oscilloscope, a 10 MHz reference; may be "
+            "repeated.",
+        ),
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask before each step; readings are still asked for.")
+    ] = False,
+    output: Output = None,
+    dry_run: DryRun = None,
+    overrides: Overrides = None,
+    _plugins: Plugins = None,
+) -> None:
+    """Measure what the driver of a device assumes, step by step, and write a file with the verdict.
+
+    It asks before each step, which says what the outputs do; the device is made safe after each of them.
+    Amplifiers must not be connected.
+    """
+    from labseq.cli.first_contact import Wanted, meet
+    from labseq.files import data_root
+
+    wanted, kind = Wanted(role, steps or (), output or data_root()), dry_run_mode(dry_run)
+    raise typer.Exit(meet(profile, wanted, overrides or (), kind, instruments=instruments or (), yes=yes))

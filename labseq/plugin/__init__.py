@@ -3,6 +3,7 @@
 What only some plugins need is in modules by subject:
 
 - ``camera``: base class of camera drivers, their settings, cooling, a simulated sensor
+- ``first_contact``: steps that prove what a driver assumes, and the file of what they measured
 - ``geometry``: sites of a grid: blocks, patterns, their order from the centre
 - ``leader``: settings, log and simulation of another control system that starts the shots
 - ``lines``: programs of a timing box, and the line that triggers a device
@@ -15,8 +16,7 @@ What only some plugins need is in modules by subject:
 - ``simulation``: what simulated devices pass to a simulation that acts on their outputs
 - ``system``: folders for files that outlive a run, other processes, a clock outside of a run
 - ``tweezers``: checks and amplitudes that drivers of static tweezers share
-- ``units``: quantities as text
-- ``wire``: messages between computers
+- ``units``, ``wire``: quantities as text; messages between computers
 
 A plugin needs no other module of labseq, except :mod:`labseq.testing` in its tests.
 """

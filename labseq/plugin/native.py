@@ -5,6 +5,7 @@ from __future__ import annotations
 from labseq.kernels.kernel import c_address, n_cores
 from labseq.kernels.native import (
     N_SIGNAL,
+    N_TIMER,
     WakeSignal,
     call_c,
     carray,
@@ -20,6 +21,7 @@ from labseq.realtime import raise_priority
 
 __all__ = [
     "N_SIGNAL",
+    "N_TIMER",
     "WakeSignal",
     "c_address",
     "call_c",

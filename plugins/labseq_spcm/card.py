@@ -9,18 +9,28 @@ from __future__ import annotations
 
 import ctypes
 import mmap
+import threading
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import Clock, DeviceError, DeviceTimeoutError
+from labseq.plugin.native import new_timer
+from labseq_spcm.kernels import give, take
 from labseq_spcm.library import Library, load_spcm
 
 POLL_S: Final = 0.2e-3
 """Time between two reads of the card's status."""
 TRANSFER_TIMEOUT_S: Final = 1.0
 """How much longer than at its slowest speed the bus may take, in seconds."""
+
+NOT_LOCKED: Final = (
+    "; connect the clock that reference_clock names (peak to peak 1 to 3 V as a sine, 0.3 to 3 V as a square "
+    "wave), or leave reference_clock out"
+)
+"""What to do where the card's PLL does not lock (levels: manual, technical data, clock)."""
 
 
 class Buffer:
@@ -40,8 +50,34 @@ class Buffer:
         return np.frombuffer(self._memory, np.int16).reshape(-1, 2)[:n_samples]
 
 
+class CallLock:
+    """One call of the driver library at a time, by Python's threads and by a compiled loop.
+
+    Attributes:
+        word: int64 (1,), 1 during a call. A loop in a thread of its own takes it for each of its calls by
+            :func:`labseq_spcm.kernels.take`; a step that the simulated card calls within a call does not.
+    """
+
+    def __init__(self) -> None:
+        self.word = np.zeros(1, np.int64)
+        self._threads = threading.RLock()
+        self._depth, self._timer = 0, new_timer()
+
+    def __enter__(self) -> None:
+        self._threads.acquire()
+        self._depth += 1
+        if self._depth == 1:
+            take(self.word.ctypes.data, self._timer)
+
+    def __exit__(self, *_: object) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            give(self.word.ctypes.data)
+        self._threads.release()
+
+
 class AwgCard:
-    """An open card.
+    """An open card. Its methods may be called from several threads.
 
     Args:
         name: Name of the device in the profile, for messages.
@@ -51,6 +87,9 @@ class AwgCard:
     Attributes:
         spcm: The vendor's package.
         library: Where the card comes from.
+        n_outputs: How many outputs the card has.
+        outputs: Those that are used, in ascending order.
+        lock: For calls of the driver library.
 
     Raises:
         DeviceError: No package or driver library, no such card, or another program holds it. Every method
@@ -62,7 +101,12 @@ class AwgCard:
         self.clock = clock
         self.spcm = spcm = load_spcm(name, library)
         self.library = library
+        self.lock = CallLock()
+        self.n_outputs = 2
+        self.outputs: tuple[int, ...] = (0, 1)
         device_name = library.connect()
+        # every slot for the card reaches 0.5 GB/s; a NETBOX has Gigabit Ethernet
+        self._slowest_bytes_per_s = 50e6 if device_name.upper().startswith("TCPIP") else 0.5e9
         self._handle: Any = spcm.spcm_hOpen(ctypes.create_string_buffer(device_name.encode()))
         if not self._handle:
             reason = self.clear_error()
@@ -72,21 +116,44 @@ class AwgCard:
 
     def close(self) -> None:
         """Close the card; what it does goes on."""
-        self.spcm.spcm_vClose(self._handle)
+        with self.lock:
+            self.spcm.spcm_vClose(self._handle)
         self.library.disconnect()
 
-    def clear_error(self) -> str:
-        """Read the pending error: until then the driver library refuses every other call."""
-        text = ctypes.create_string_buffer(self.spcm.ERRORTEXTLEN)
-        self.spcm.spcm_dwGetErrorInfo_i32(self._handle or None, None, None, ctypes.byref(text))
-        return " ".join(text.value.decode(errors="replace").split())
+    def clear_error(self, code: int = 0) -> str:
+        """Read the pending error: until then the driver library refuses every other call.
 
-    def _check(self, code: int, action: str) -> None:
-        """Raise the error that a function of the driver library has returned."""
+        Args:
+            code: What the refused function returned; named if the library has no text for it.
+        """
+        spcm = self.spcm
+        buffer = ctypes.create_string_buffer(spcm.ERRORTEXTLEN)
+        with self.lock:
+            pending = spcm.spcm_dwGetErrorInfo_i32(self._handle or None, None, None, ctypes.byref(buffer))
+        text = " ".join(buffer.value.decode(errors="replace").split())
+        return text or self._error_name(code or pending)
+
+    def _error_name(self, code: int) -> str:
+        """The vendor's name and number of an error."""
+        errors = (name for name, value in vars(self.spcm).items() if value == code and name[:4] == "ERR_")
+        return f"{next(errors, 'error')} ({code:#x})"
+
+    def _call(self, action: str, function: Callable[..., int], *arguments: Any) -> None:
+        """Call a function of the driver library, and raise the error that it returns.
+
+        Args:
+            action: What is being done, for messages.
+            function: Of ``spcm_core``.
+            arguments: Those after the handle.
+        """
+        with self.lock:  # until the error is read, the library refuses what other threads call
+            code = function(self._handle, *arguments)
+            reason = self.clear_error(code) if code not in (0, self.spcm.ERR_TIMEOUT) else ""
         if code == self.spcm.ERR_TIMEOUT:
             raise DeviceTimeoutError(self.name, f"{action}: the card's driver timed out", 0.0)
         if code:
-            raise DeviceError(self.name, f"{action}: {self.clear_error()}")
+            hint = NOT_LOCKED if code == self.spcm.ERR_CLOCKNOTLOCKED else ""
+            raise DeviceError(self.name, f"{action}: {reason}{hint}")
 
     @property
     def handle(self) -> int:
@@ -97,8 +164,8 @@ class AwgCard:
     def product(self) -> str:
         """Product name, such as "M4i.6631-x8"."""
         spcm, text = self.spcm, ctypes.create_string_buffer(32)
-        code = spcm.spcm_dwGetParam_ptr(self._handle, spcm.SPC_PCITYP, text, ctypes.c_uint64(len(text)))
-        self._check(code, "reading the product name")
+        room = ctypes.c_uint64(len(text))
+        self._call("reading the product name", spcm.spcm_dwGetParam_ptr, spcm.SPC_PCITYP, text, room)
         return text.value.decode(errors="replace")
 
     @property
@@ -117,6 +184,11 @@ class AwgCard:
         return not self.status & self.spcm.M2STAT_CARD_READY
 
     @property
+    def ran_dry(self) -> bool:
+        """Whether a stream has ended for want of samples; the manual does not say that it is ready then."""
+        return bool(self.status & self.spcm.M2STAT_DATA_OVERRUN)
+
+    @property
     def triggered(self) -> bool:
         """Whether a trigger has come since the start."""
         return bool(self.status & self.spcm.M2STAT_CARD_TRIGGER)
@@ -124,13 +196,13 @@ class AwgCard:
     def read(self, register: int) -> int:
         """Read a register."""
         value = ctypes.c_int64()
-        code = self.spcm.spcm_dwGetParam_i64(self._handle, register, ctypes.byref(value))
-        self._check(code, f"reading register {register}")
+        get = self.spcm.spcm_dwGetParam_i64
+        self._call(f"reading register {register}", get, register, ctypes.byref(value))
         return value.value
 
     def write(self, register: int, value: int, name: str) -> None:
         """Write a register that cannot be read back."""
-        self._check(self.spcm.spcm_dwSetParam_i64(self._handle, register, value), f"{name} = {value}")
+        self._call(f"{name} = {value}", self.spcm.spcm_dwSetParam_i64, register, value)
 
     def set(self, register: int, value: int, name: str, tolerance: int = 0) -> int:
         """Write a register and read it back: the card rounds some values and snaps others.
@@ -152,7 +224,7 @@ class AwgCard:
 
     def command(self, command: int, action: str) -> None:
         """Send a command, one or several M2CMD bits."""
-        self._check(self.spcm.spcm_dwSetParam_i64(self._handle, self.spcm.SPC_M2CMD, command), action)
+        self._call(action, self.spcm.spcm_dwSetParam_i64, self.spcm.SPC_M2CMD, command)
 
     def write_setup(self) -> None:
         """Send the settings to the card: until then, or until the start, only its driver has them."""
@@ -162,26 +234,56 @@ class AwgCard:
         """Name the samples of the next transfer; the array must live until the transfer is over."""
         spcm, address = self.spcm, ctypes.c_void_p(frames.ctypes.data)
         kind, direction = spcm.SPCM_BUF_DATA, spcm.SPCM_DIR_PCTOCARD
-        self._check(
-            spcm.spcm_dwDefTransfer_i64(
-                self._handle, kind, direction, notify_bytes, address, 0, frames.nbytes
-            ),
-            "naming the transfer buffer",
-        )
+        buffer = kind, direction, notify_bytes, address, 0, frames.nbytes
+        self._call("naming the transfer buffer", spcm.spcm_dwDefTransfer_i64, *buffer)
 
-    def upload(self, frames: NDArray[np.int16], poll_s: float = POLL_S) -> None:
+    def wait_for_transfer(self, handed_bytes: int) -> None:
+        """Wait until a stream's transfer has reported its first block, as M2CMD_DATA_WAITDMA does.
+
+        The command is not used, because it cannot be interrupted.
+
+        Args:
+            handed_bytes: What the card may fetch, for the message.
+
+        Raises:
+            DeviceTimeoutError: It has not within ``TRANSFER_TIMEOUT_S``.
+        """
+        deadline_s = self.clock.now() + TRANSFER_TIMEOUT_S
+        while not self.status & self.spcm.M2STAT_DATA_BLOCKREADY:
+            if self.clock.now() > deadline_s:
+                fetched = self.read(self.spcm.SPC_DATA_AVAIL_USER_LEN)
+                raise self.not_fetched(fetched, handed_bytes)
+            self.clock.sleep(POLL_S)
+
+    def not_fetched(self, fetched_bytes: int, expected_bytes: int) -> DeviceTimeoutError:
+        """The error of a stream that cannot be started."""
+        text = f"the card fetched {fetched_bytes} of {expected_bytes} bytes, and was not started"
+        hint = "use mode: replay, and see the card's bus in Spectrum's Control Center"
+        return DeviceTimeoutError(self.name, f"{text}; {hint}", TRANSFER_TIMEOUT_S)
+
+    def upload(self, frames: NDArray[np.int16], poll_s: float = POLL_S) -> float:
         """Transfer samples to the on-board memory, and wait until they have arrived.
+
+        Returns:
+            How long that took, in seconds, without the naming of the buffer, which pins its pages.
 
         Raises:
             DeviceTimeoutError: They take too long.
         """
-        self.begin_upload(frames)
+        start_s = self.begin_upload(frames)
         self.finish_upload(frames.nbytes, poll_s)
+        return self.clock.now() - start_s
 
-    def begin_upload(self, frames: NDArray[np.int16]) -> None:
-        """Begin to transfer samples to the on-board memory; the array must live until they have arrived."""
+    def begin_upload(self, frames: NDArray[np.int16]) -> float:
+        """Begin to transfer samples to the on-board memory; the array must live until they have arrived.
+
+        Returns:
+            When it began, without the naming of the buffer.
+        """
         self.define_transfer(frames)
+        start_s = self.clock.now()
         self.command(self.spcm.M2CMD_DATA_STARTDMA, "upload")
+        return start_s
 
     def finish_upload(self, n_bytes: int, poll_s: float) -> None:
         """Wait until all has arrived.
@@ -189,7 +291,7 @@ class AwgCard:
         Raises:
             DeviceTimeoutError: It takes too long.
         """
-        limit_s = n_bytes / 0.5e9 + TRANSFER_TIMEOUT_S  # every slot for the card reaches 0.5 GB/s
+        limit_s = n_bytes / self._slowest_bytes_per_s + TRANSFER_TIMEOUT_S
         deadline_s = self.clock.now() + limit_s
         while not self.status & self.spcm.M2STAT_DATA_END:
             if self.clock.now() > deadline_s:
@@ -200,5 +302,4 @@ class AwgCard:
         """Stop playing and transferring; no effect if it does neither."""
         spcm = self.spcm
         self.command(spcm.M2CMD_CARD_STOP | spcm.M2CMD_DATA_STOPDMA, "stop")
-        code = spcm.spcm_dwInvalidateBuf(self._handle, spcm.SPCM_BUF_DATA)
-        self._check(code, "releasing the transfer buffer")
+        self._call("releasing the transfer buffer", spcm.spcm_dwInvalidateBuf, spcm.SPCM_BUF_DATA)

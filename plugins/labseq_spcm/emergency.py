@@ -15,8 +15,7 @@ from functools import cache
 from typing import Any
 
 SPC_M2CMD, SPC_M2STATUS = 100, 110
-SPC_AMP0, SPC_AMP1 = 30010, 30110
-SPC_ENABLEOUT0, SPC_ENABLEOUT1 = 30091, 30191
+SPC_AMP0, SPC_ENABLEOUT0, NEXT_OUTPUT = 30010, 30091, 100
 M2CMD_CARD_RESET, M2CMD_CARD_WRITESETUP = 0x1, 0x2
 M2CMD_CARD_STOP, M2CMD_DATA_STOPDMA = 0x40, 0x40000
 M2STAT_CARD_READY = 0x4
@@ -30,7 +29,7 @@ class EmergencyError(Exception):
     """The card could not be switched off; the text says why."""
 
 
-def prepare(library: str, card: str) -> None:
+def prepare(library: str, card: str, n_outputs: int = 2) -> None:
     """Load the driver library; does not touch the card.
 
     Raises:
@@ -38,15 +37,18 @@ def prepare(library: str, card: str) -> None:
     """
     if not card or type(card) is not str:
         raise EmergencyError(f"the card's device name is {card!r}; expected a text such as '/dev/spcm0'")
+    if type(n_outputs) is not int or not 2 <= n_outputs <= 4:
+        raise EmergencyError(f"the card's number of outputs is {n_outputs!r}; expected 2 to 4")
     load(library)
 
 
-def off(library: str, card: str) -> str:
-    """Stop the card, disable both outputs, and close it; a card that is off stays off.
+def off(library: str, card: str, n_outputs: int = 2) -> str:
+    """Stop the card, disable its outputs, and close it; a card that is off stays off.
 
     Args:
         library: The driver library.
         card: The card's device name.
+        n_outputs: How many outputs it has.
 
     Returns:
         What was done.
@@ -54,8 +56,8 @@ def off(library: str, card: str) -> str:
     Raises:
         EmergencyError: The card cannot be opened, or refuses; the text is the driver library's.
     """
-    prepare(library, card)
-    device = _Card(load(library), card)
+    prepare(library, card, n_outputs)
+    device = _Card(load(library), card, n_outputs)
     try:
         return device.switch_off()
     finally:
@@ -88,8 +90,8 @@ def signed(library: Any) -> Any:
 class _Card:
     """The open card."""
 
-    def __init__(self, library: Any, name: str) -> None:
-        self._library = library
+    def __init__(self, library: Any, name: str, n_outputs: int) -> None:
+        self._library, self._outputs = library, range(n_outputs)
         deadline_s = time.monotonic() + HELD_S
         while not (handle := library.spcm_hOpen(name.encode())):
             reason = _error(library, None)
@@ -102,10 +104,11 @@ class _Card:
         """All steps, also after one that was refused; then check that the card took them."""
         steps: list[tuple[int, int, str]] = [
             (SPC_M2CMD, M2CMD_CARD_STOP | M2CMD_DATA_STOPDMA, "stop"),
-            (SPC_AMP0, LOWEST_MV, "lowest amplitude of output 0"),
-            (SPC_AMP1, LOWEST_MV, "lowest amplitude of output 1"),
-            (SPC_ENABLEOUT0, 0, "disabling output 0"),
-            (SPC_ENABLEOUT1, 0, "disabling output 1"),
+            *(
+                (SPC_AMP0 + NEXT_OUTPUT * n, LOWEST_MV, f"lowest amplitude of output {n}")
+                for n in self._outputs
+            ),
+            *((SPC_ENABLEOUT0 + NEXT_OUTPUT * n, 0, f"disabling output {n}") for n in self._outputs),
             (SPC_M2CMD, M2CMD_CARD_WRITESETUP, "writing the set-up"),
             (SPC_M2CMD, M2CMD_CARD_RESET, "reset of the card"),
         ]
@@ -118,11 +121,12 @@ class _Card:
         if len(refused) > 1 and "reset of the card" in refused:
             raise EmergencyError(reasons)
         status = self._read(SPC_M2STATUS)
-        enabled = [n for n, register in enumerate((SPC_ENABLEOUT0, SPC_ENABLEOUT1)) if self._read(register)]
+        enabled = [n for n in self._outputs if self._read(SPC_ENABLEOUT0 + NEXT_OUTPUT * n)]
         if enabled or not status & M2STAT_CARD_READY:
             text = f"the card reads status {status:#x} and enabled outputs {enabled}"
             raise EmergencyError(f"{text}; {reasons}" if reasons else text)
-        outcome = "card stopped, outputs 0 and 1 disabled"
+        *first, last = map(str, self._outputs)
+        outcome = f"card stopped, outputs {', '.join(first)} and {last} disabled"
         how = "" if "reset of the card" in refused else " by its reset"
         return f"{outcome}{how}; refused: {reasons}" if refused else outcome
 

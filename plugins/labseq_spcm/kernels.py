@@ -1,4 +1,4 @@
-"""The order of samples on the card."""
+"""The order of samples on the card, and the lock of the driver library's calls."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq.plugin import const, kernel
+from labseq.plugin.native import sleep_ns, swap
 
 Words = NDArray[np.uint16]
+Longs = NDArray[np.int64]
 
 
 @kernel(f"void({const('uint16', 1)}, {const('uint16', 1)}, uint32[::1])")
@@ -19,3 +21,19 @@ def interleave(first: Words, second: Words, out: NDArray[np.uint32]) -> None:
     """
     for i in range(len(out)):
         out[i] = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(16))
+
+
+@kernel("void(int64, int64[::1])")
+def take(lock: int, timer: Longs) -> None:
+    """Wait until the int64 at an address is 0, and make it 1.
+
+    It sleeps in between: on one core a thread with priority would keep the owner from giving it back.
+    """
+    while swap(lock, 1):
+        sleep_ns(timer, 2_000)
+
+
+@kernel("void(int64)")
+def give(lock: int) -> None:
+    """Make the int64 at an address 0 again."""
+    swap(lock, 0)

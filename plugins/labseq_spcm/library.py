@@ -69,9 +69,13 @@ class VendorLibrary:
         """
         return False
 
-    def emergency(self, script: Path) -> Emergency | None:
+    def step_time_s(self) -> float:
+        """The time of the step that is being called: there are none."""
+        return 0.0
+
+    def emergency(self, script: Path, n_outputs: int) -> Emergency | None:
         """The driver's script that switches the card off from another process, with the vendor's library."""
-        return Emergency(script, {"library": LIBRARY, "card": self._device_name})
+        return Emergency(script, {"library": LIBRARY, "card": self._device_name, "n_outputs": n_outputs})
 
 
 Library: TypeAlias = "VendorLibrary | SimulatedLibrary"
@@ -82,14 +86,18 @@ def choose_library(name: str, settings: SpcmSettings, context: Context) -> Libra
 
     Raises:
         DeviceError: The package ``spcm_core`` is missing, from which the simulated card has its registers.
+        ConfigError: The file that ``faults.first_contact`` names is missing or was edited.
     """
     if not settings.card.startswith(SIMULATED):
         return VendorLibrary(settings.card)
     try:
-        from labseq_spcm_sim import SimulatedLibrary
+        from labseq_spcm_sim import SimulatedLibrary, card_with
     except ModuleNotFoundError as error:
         raise _not_installed(name, error) from error
-    return SimulatedLibrary(settings.card, context.clock, context.simulation, settings.row_channel)
+    new_card = card_with(settings.faults.model_dump(), settings.model)
+    return SimulatedLibrary(
+        settings.card, context.clock, context.simulation, *settings.outputs, new_card=new_card
+    )
 
 
 def load_spcm(name: str, library: Library) -> Any:

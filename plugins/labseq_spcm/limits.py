@@ -6,31 +6,28 @@ analog outputs, clock, generation modes and trigger.
 
 from __future__ import annotations
 
-from typing import Final
+import math
+from typing import TYPE_CHECKING, Final
 
-from labseq.plugin import LimitError, format_quantity
+from labseq.plugin import LimitError, SiteGrid, format_quantity
 from labseq.plugin.motion import RfSpec
 
-FAMILY: Final = 0x66
-"""Second byte of the card type: M4i.66xx."""
-FAMILY_NAME: Final = "a Spectrum M4i.66xx with two outputs, such as the M4i.6631-x8"
+if TYPE_CHECKING:
+    from labseq_spcm.models import Model
 
-SAMPLE_RATE_HZ: Final = (50e6, 1.25e9)
 RATE_GAPS_HZ: Final = ((750e6, 757e6), (1125e6, 1145e6))
 """Sample rates that the clock cannot make."""
 RATE_STEP_HZ: Final = 8
+"""Steps of the sample rate with the card's own clock."""
+REFERENCE_TOLERANCE: Final = 1e-3
+"""By how much of itself the rate may differ with an external reference, for which the manual gives no steps
+(ours). The samples are those of the rate that the card reads."""
 REFERENCE_HZ: Final = (10e6, 1.25e9)
-FIFO_RATE_HZ: Final = 700e6
-"""2.8 GB/s over PCIe x8 Gen 2 (the vendor's page on generator modes), for two channels of 2 bytes."""
 FRAME_BYTES: Final = 4
 """Bytes of one sample of both outputs."""
 OUTPUT_FIFO_BYTES: Final = 192 * 1024
 """Of the FIFO between the on-board memory and the outputs, whose size is fixed (manual, "Output latency")."""
 
-AMPLITUDE_MV: Final = (80, 2000)
-"""Peak voltage into 50 Ohm of an M4i.663x, in steps of 1 mV."""
-RELAY_MV: Final = (420, 480)
-"""Both paths of the amplifier make these amplitudes; which one is used depends on the earlier amplitude."""
 RELAY_S: Final = 10e-3
 """Time that the output is off when the path changes; the manual gives none for the output's own relay."""
 
@@ -45,24 +42,53 @@ def trigger_delay_s(sample_rate_hz: float) -> float:
     return (476.5 if sample_rate_hz > 625e6 else 238.5) / sample_rate_hz + 16e-9
 
 
-def full_scale_mv(name: str, rf: RfSpec) -> int:
+def full_scale_mv(name: str, rf: RfSpec, model: Model) -> int:
     """The output amplitude for the profile's ``rf.full_scale``, in millivolts.
+
+    Args:
+        name: Name of the device, for messages.
+        rf: The profile's section.
+        model: What the card can do.
 
     Raises:
         LimitError: The card cannot make it, its relay might switch, or it is too much for the amplifiers.
     """
     setting, amplitude_mv = f"{name}: rf.full_scale", round(1e3 * rf.full_scale_v)
     value = format_quantity(rf.full_scale_v, "voltage")
-    low, high = AMPLITUDE_MV
+    low, high = model.amplitude_mv
     if not low <= amplitude_mv <= high:
-        raise LimitError(setting, value, f"the card's {low} mV to {high} mV")
-    if RELAY_MV[0] <= amplitude_mv <= RELAY_MV[1]:
-        gap = f"below {RELAY_MV[0]} mV or above {RELAY_MV[1]} mV"
-        raise LimitError(setting, value, gap, "between them the card's output relay may switch, for 10 ms")
+        raise LimitError(setting, value, f"the {model.name}'s {low} mV to {high} mV")
+    relay_mv = model.relay_mv
+    if relay_mv is not None and relay_mv[0] <= amplitude_mv <= relay_mv[1]:
+        gap = f"below {relay_mv[0]} mV or above {relay_mv[1]} mV"
+        why = "between them the card's output relay may switch, for 10 ms; for a card with -hbw set `model`"
+        raise LimitError(setting, value, gap, why)
     if rf.full_scale_v > rf.max_peak_v:
         most = format_quantity(rf.max_peak_v, "voltage")
         raise LimitError(setting, value, f"rf.max_peak, {most}", "more damages the amplifiers")
     return amplitude_mv
+
+
+def reference_warnings(name: str, rate_hz: float, reference_hz: float | None, grid: SiteGrid) -> list[str]:
+    """The rates to use if a sample rate is no whole multiple of the reference clock, as the manual asks."""
+    if reference_hz is None or rate_hz % reference_hz == 0:
+        return []
+    below = math.floor(rate_hz / reference_hz)
+    near = [n * reference_hz for n in (below, below + 1)]
+    spacings = [
+        abs(float(hz[1] - hz[0])) for hz in (grid.row_frequency_hz, grid.column_frequency_hz) if len(hz) > 1
+    ]
+    most = math.floor(1.1 * rate_hz / reference_hz)
+    multiples = [n * reference_hz for n in range(math.ceil(0.9 * rate_hz / reference_hz), most + 1)]
+    combs = [hz for hz in multiples if all(abs(hz / s - round(hz / s)) < 1e-6 for s in spacings)]
+    best = min(combs or near, key=lambda hz: abs(hz - rate_hz))
+    rate, reference, low, high, good = (
+        format_quantity(hz, "frequency") for hz in (rate_hz, reference_hz, *near, best)
+    )
+    what = f"profile.{name}.sample_rate is {rate}, not a whole multiple of reference_clock, {reference}"
+    why = "the PLL may be unable to make it, and its phase may differ from start to start"
+    renders = ", which also has a whole number of samples per tone spacing" if combs else ""
+    return [f"{what}: {why}; the nearest multiples are {low} and {high}; set sample_rate: {good}{renders}"]
 
 
 def check_sample_rate(name: str, sample_rate_hz: float, rf: RfSpec) -> None:

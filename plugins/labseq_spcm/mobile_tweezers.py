@@ -1,4 +1,4 @@
-"""Mobile tweezers on a Spectrum M4i.66xx arbitrary waveform generator.
+"""Mobile tweezers on a Spectrum arbitrary waveform generator.
 
 In the manual's order: in ``open`` the card is identified, reset and set up (``set_up.py``), then its mode; in
 ``settle`` the outputs; in ``prepare`` the data, in ``play`` the start and the trigger; then stop and close.
@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from labseq.plugin import (
     ConfigError,
@@ -42,9 +42,12 @@ from labseq_spcm.set_up import check_type, close_relays, set_amplitude, set_up, 
 from labseq_spcm.settings import NO_TRIGGER, SpcmSettings
 from labseq_spcm.stream import Stream, check_rendering
 
+if TYPE_CHECKING:
+    from labseq.plugin.first_contact import FirstContact
+
 RAMP_STEPS: Final = 15
 HOT_C: Final = 80
-"""Highest temperature that passes the self test, in degrees Celsius (our choice)."""
+"""Highest temperature of both sensors, in degrees Celsius (manual, "Temperature sensors")."""
 TEST_SAMPLES: Final = 1 << 16
 """Samples of both outputs, all 0, that the self test sends to the card's memory."""
 
@@ -82,7 +85,8 @@ class SpcmMobileTweezers(MobileTweezers):
         self._context = context
         self._clock = context.clock
         self._rf = context.motion.rf
-        self._amplitude_mv = limits.full_scale_mv(self._name, self._rf)
+        self._amplitude_mv = limits.full_scale_mv(self._name, self._rf, settings.limits)
+        self._model = settings.limits
         limits.check_sample_rate(self._name, settings.sample_rate, self._rf)
         warm = settings.keep_warm
         self._keep_warm = None if warm is None else keep_warm_tones(self._name, warm, context)
@@ -128,7 +132,12 @@ class SpcmMobileTweezers(MobileTweezers):
         return math.inf if self._mode is None else self._mode.beginning_s
 
     def warnings(self) -> list[str]:
-        """The sample rate, if another one is rendered several times faster."""
+        """A rate that does not suit the reference clock, or of which another is rendered much faster."""
+        settings, grid = self._settings, self._context.grid
+        found = limits.reference_warnings(self._name, settings.sample_rate, settings.reference_clock, grid)
+        return found + self._rendering_warnings()
+
+    def _rendering_warnings(self) -> list[str]:
         rate_hz = self._settings.sample_rate
         try:
             best_hz = comb_sample_rate(self._context.grid, rate_hz)
@@ -167,12 +176,15 @@ class SpcmMobileTweezers(MobileTweezers):
             DeviceError: No package or driver library, no such card, another program holds it, it
                 is of another type, or it does not take a setting; or the bus or this computer is too
                 slow for the mode ``stream``.
+            LimitError: This card cannot do the profile's ``rf.full_scale``.
         """
         if self._card is not None:
             return
         self._card = card = AwgCard(self._name, self.library, self._clock)
         try:
-            check_type(card, self._settings)
+            self._model = check_type(card, self._settings)
+            limits.full_scale_mv(self._name, self._rf, self._model)
+            card.n_outputs, card.outputs = self._model.n_outputs, tuple(sorted(self._settings.outputs))
             self._facts = set_up(card, self._settings, self._amplitude_mv)
             self._mode = self._new_mode(card)
         except BaseException:
@@ -183,9 +195,9 @@ class SpcmMobileTweezers(MobileTweezers):
         rate_hz = self._facts["sample_rate_hz"]
         if self._settings.mode == "stream":
             if not self._clock.virtual:  # virtual time waits for the rendering
-                check_rendering(self._name, self._context, rate_hz, self._settings.row_channel)
+                check_rendering(self._name, self._context, rate_hz, self._settings.row_index)
             stream = Stream(card, self._settings, rate_hz, self._keep_warm)
-            self._facts["trigger_delay_s"] = stream.delay_s
+            self._facts |= {"trigger_delay_s": stream.delay_s, "bus_bytes_per_s": stream.bus_bytes_per_s}
             return stream
         if self._settings.mode == "sequence":
             sequence = SequenceReplay(card, self._settings, rate_hz, self._keep_warm)
@@ -338,8 +350,7 @@ class SpcmMobileTweezers(MobileTweezers):
             mode.halt()
         steps: list[Callable[[], None]] = [
             card.stop,
-            partial(switch_output, card, 0, on=False),
-            partial(switch_output, card, 1, on=False),
+            *(partial(switch_output, card, output, on=False) for output in range(card.n_outputs)),
             card.write_setup,
             partial(set_amplitude, card, self._amplitude_mv),
         ]
@@ -349,8 +360,9 @@ class SpcmMobileTweezers(MobileTweezers):
 
     def _ramp_down(self, card: AwgCard) -> None:
         """Lower the amplitude in steps within 0.3 ms, in the amplifier's present path."""
-        above_relay = limits.RELAY_MV[1] + 1
-        end_mv = above_relay if self._amplitude_mv >= above_relay else limits.AMPLITUDE_MV[0]
+        relay_mv, end_mv = self._model.relay_mv, self._model.amplitude_mv[0]
+        if relay_mv is not None and self._amplitude_mv > relay_mv[1]:
+            end_mv = relay_mv[1] + 1
         for step in range(1, RAMP_STEPS + 1):
             self._clock.sleep(0.3e-3 / RAMP_STEPS)
             drop_mv = (self._amplitude_mv - end_mv) * step / RAMP_STEPS
@@ -371,7 +383,13 @@ class SpcmMobileTweezers(MobileTweezers):
     def emergency(self) -> Emergency | None:
         """The card is stopped, and its outputs are disabled, by the vendor's library alone."""
         script = Path(__file__).with_name("emergency.py")
-        return None if self._card is None else self.library.emergency(script)
+        return None if self._card is None else self.library.emergency(script, self._card.n_outputs)
+
+    def first_contact(self) -> FirstContact:
+        """Steps that prove what this driver assumes about the card."""
+        from labseq_spcm.first_contact import SpcmFirstContact
+
+        return SpcmFirstContact(self._settings, self._context, self.library)
 
     def self_test(self) -> None:
         """Check the card's firmware, temperatures, clock and memory, outputs off; drops the prepared program.
@@ -391,7 +409,7 @@ class SpcmMobileTweezers(MobileTweezers):
         if card.read(spcm.SPCM_FW_CTRL_ACTIVE) >> 28 == 2:
             text = "the card runs its recovery firmware; restart the computer, else update the firmware"
             raise DeviceError(self._name, f"{text} with Spectrum's Control Center")
-        sensors = (("base card", spcm.SPC_MON_TC_BASE_CTRL), ("output module", spcm.SPC_MON_TC_MODULE_0))
+        sensors = (("base card", spcm.SPC_MON_TC_BASE_CTRL), ("amplifier", spcm.SPC_MON_TC_MODULE_1))
         for place, register in sensors:
             temperature_c = card.read(register)
             if temperature_c > HOT_C:
@@ -416,7 +434,8 @@ class SpcmMobileTweezers(MobileTweezers):
             facts["silent_underruns"] = self._mode.n_underruns
         if isinstance(self._mode, Stream | SequenceReplay):
             facts["delayed_batches"] = self._mode.n_pauses
-        return {"model": "Spectrum M4i.66xx", **self._settings.model_dump(mode="json"), **facts}
+        settings = self._settings.model_dump(mode="json")
+        return {**settings, "model": self._model.name, **facts}
 
     def _opened(self) -> tuple[AwgCard, PlayMode]:
         if self._card is None or self._mode is None:

@@ -92,18 +92,18 @@ class SequenceReplay(PlayMode):
         if not card.read(spcm.SPC_PCIFEATURES) & spcm.SPCM_FEAT_SEQUENCE:
             text = f"the {card.product} has no sequence mode (SPCM_FEAT_SEQUENCE)"
             raise DeviceError(card.name, f"{text}; use mode: replay, or update the card's firmware")
-        self._row_channel, self._rate_hz = settings.row_channel, sample_rate_hz
+        self._row_channel, self._rate_hz = settings.row_index, sample_rate_hz
         self._waits_for_edge = settings.trigger == "external"
         n_idle = SILENT_SAMPLES if keep_warm is None else WARM_SAMPLES
         self.delay_s = (n_idle + OUTPUT_FIFO_BYTES // 2 // FRAME_BYTES) / sample_rate_hz
         self.n_pauses = 0
-        self._buffers = (Buffer(), Buffer())
         self._is_on = False
         self._divide_memory()
+        self._buffers = (Buffer(), Buffer())
         idle = Buffer().reserve(n_idle)
-        idle[:] = (
-            0 if keep_warm is None else tone_samples(keep_warm, sample_rate_hz, self._row_channel, n_idle)
-        )
+        idle[:] = 0
+        if keep_warm is not None:
+            idle[:] = tone_samples(keep_warm, sample_rate_hz, self._row_channel, n_idle)
         self._send(IDLE_SEGMENT, idle)
         self._card.finish_upload(idle.nbytes, POLL_S)
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import DeviceError, DeviceTimeoutError, LimitError, ToneProgram, TransientError
+from labseq.plugin import DeviceError, LimitError, ToneProgram, TransientError
 from labseq.plugin.rendering import Renderer
 from labseq_spcm.card import POLL_S, TRANSFER_TIMEOUT_S, AwgCard, Buffer
 from labseq_spcm.limits import FRAME_BYTES, SAMPLE_STEP
@@ -19,6 +19,7 @@ from labseq_spcm.settings import SpcmSettings
 CHUNK: Final = 1 << 18
 """Samples rendered at a time, 0.4 ms at 625 MS/s: few enough to stay in the processor's cache."""
 RING_CHUNKS: Final = 4
+CHUNK_BYTES: Final = CHUNK * FRAME_BYTES
 
 
 class InterleavedRenderer:
@@ -67,7 +68,7 @@ class Replay(PlayMode):
 
     def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
         super().__init__(card)
-        self._row_channel, self._rate_hz = settings.row_channel, sample_rate_hz
+        self._row_channel, self._rate_hz = settings.row_index, sample_rate_hz
         self._buffer = Buffer()
         spcm = card.spcm
         card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_SINGLE, "card mode")
@@ -108,22 +109,24 @@ class Fifo(PlayMode):
 
     Rendered chunks go into a ring in the computer, from there over the bus into the card's memory,
     and from there to the outputs. Ring and memory are bounded, so a program is rendered about
-    ``fill`` ahead. Before the start both are filled, or hold the whole program. The card knows how
-    many samples to play: it stops after them, and reports if it runs dry before.
+    ``fill`` ahead. Before the start both are filled, or hold the whole program: the ring is rendered and
+    handed over, the transfer started, and when the card reports its first block the rest follows, except
+    for the last chunk of its memory, of which it may keep a part for itself. The card knows how many
+    samples to play: it stops after them, and reports if it runs dry before.
     """
 
     max_wait_s = 0.0
 
     def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
         super().__init__(card)
-        self._row_channel, self._rate_hz = settings.row_channel, sample_rate_hz
+        self._row_channel, self._rate_hz = settings.row_index, sample_rate_hz
         self._ring = Buffer().reserve(RING_CHUNKS * CHUNK)
         self._half_ring_s = RING_CHUNKS / 2 * CHUNK / sample_rate_hz
         self._renderer: InterleavedRenderer | None = None
         self._n_rendered = self._n_samples = 0
         ahead = int(settings.fill_s * sample_rate_hz) * FRAME_BYTES - self._ring.nbytes
         # of the on-board memory, in bytes; the card takes powers of two
-        self._fill = 1 << round(math.log2(max(1 << 20, ahead)))
+        self._fill = 1 << round(math.log2(max(2 * CHUNK_BYTES, ahead)))
         spcm = card.spcm
         card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_FIFO_SINGLE, "card mode")
         card.set(spcm.SPC_LOOPS, 1, "loops")
@@ -139,15 +142,17 @@ class Fifo(PlayMode):
         self._n_samples, self._n_rendered = self._renderer.n_samples, 0
         card.stop()
         card.set(spcm.SPC_SEGMENTSIZE, self._n_samples, "number of samples")
-        card.define_transfer(self._ring, CHUNK * FRAME_BYTES)
-        self._feed()
+        card.define_transfer(self._ring, CHUNK_BYTES)
+        while self._n_rendered < min(self._n_samples, len(self._ring)):  # the whole ring is free
+            self._feed_chunk(self._renderer)
         card.command(spcm.M2CMD_DATA_STARTDMA, "transfer")
+        card.wait_for_transfer(self._n_rendered * FRAME_BYTES)
         deadline_s = card.clock.now() + TRANSFER_TIMEOUT_S
-        full = min(self._n_samples, (self._fill + self._ring.nbytes) // FRAME_BYTES)
+        full = min(self._n_samples, (self._fill - CHUNK_BYTES + self._ring.nbytes) // FRAME_BYTES)
         while self._n_rendered < full:
             if card.clock.now() > deadline_s:
-                text = f"the card fetched {self._n_rendered} of {full} samples"
-                raise DeviceTimeoutError(card.name, text, TRANSFER_TIMEOUT_S)
+                fetched = self._n_rendered * FRAME_BYTES - self._ring.nbytes
+                raise card.not_fetched(fetched, full * FRAME_BYTES - self._ring.nbytes)
             if not self._feed():
                 card.clock.sleep(POLL_S)
         return self._n_samples / self._rate_hz
@@ -178,12 +183,16 @@ class Fifo(PlayMode):
         for n_chunks in range(RING_CHUNKS):
             if renderer is None or self._n_rendered >= self._n_samples:
                 return n_chunks
-            if card.read(spcm.SPC_DATA_AVAIL_USER_LEN) < CHUNK * FRAME_BYTES:
+            if card.read(spcm.SPC_DATA_AVAIL_USER_LEN) < CHUNK_BYTES:
                 return n_chunks
-            first = self._n_rendered % len(self._ring)
-            start_s = time.perf_counter()
-            renderer.write(self._n_rendered, self._ring[first : first + CHUNK])
-            self.render_s += time.perf_counter() - start_s
-            card.write(spcm.SPC_DATA_AVAIL_CARD_LEN, CHUNK * FRAME_BYTES, "handing samples over")
-            self._n_rendered += CHUNK
+            self._feed_chunk(renderer)
         return RING_CHUNKS
+
+    def _feed_chunk(self, renderer: InterleavedRenderer) -> None:
+        """Render the next chunk into the ring and hand it over."""
+        first = self._n_rendered % len(self._ring)
+        start_s = time.perf_counter()
+        renderer.write(self._n_rendered, self._ring[first : first + CHUNK])
+        self.render_s += time.perf_counter() - start_s
+        self._card.write(self._card.spcm.SPC_DATA_AVAIL_CARD_LEN, CHUNK_BYTES, "handing samples over")
+        self._n_rendered += CHUNK

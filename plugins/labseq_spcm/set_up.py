@@ -6,40 +6,89 @@ snaps others.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import metadata
-from typing import Any
+from typing import Any, Final
 
 from labseq.plugin import DeviceError
 from labseq_spcm import limits
 from labseq_spcm.card import AwgCard
+from labseq_spcm.models import FAMILY_NAMES, HIGH_BANDWIDTH, MODELS, Model, model_name
 from labseq_spcm.settings import SpcmSettings
 
+NEXT_OUTPUT: Final = 100
+"""From a register of an output to that of the next one."""
 
-def check_type(card: AwgCard, settings: SpcmSettings) -> None:
+
+def check_type(card: AwgCard, settings: SpcmSettings) -> Model:
     """Check that it is the card that the settings name, and that it can do what they ask for.
 
     Raises:
         DeviceError: It is another one, or too slow.
     """
-    spcm = card.spcm
-    n_channels = card.read(spcm.SPC_MIINST_MODULES) * card.read(spcm.SPC_MIINST_CHPERMODULE)
-    family = (card.read(spcm.SPC_PCITYP) & spcm.TYP_FAMILYMASK) >> 8
-    if family != limits.FAMILY or n_channels != 2:
-        text = f"the card '{settings.card}' is a {card.product} with {n_channels} channels"
-        raise DeviceError(card.name, f"{text}; expected {limits.FAMILY_NAME}: name another one as `card`")
+    model = read_model(card, settings.card, settings.model)
     if settings.serial and card.serial_number != settings.serial:
         text = f"the card '{settings.card}' has the serial number {card.serial_number}"
         raise DeviceError(card.name, f"{text}; expected {settings.serial}: name another one as `card`")
-    fastest_hz, rate_hz = card.read(spcm.SPC_MIINST_MAXADCLOCK), settings.sample_rate
-    if rate_hz > fastest_hz:
-        text = f"the {card.product} makes at most {fastest_hz / 1e6:g} MS/s"
-        raise DeviceError(card.name, f"{text}; lower sample_rate from {rate_hz / 1e6:g} MHz")
+    if max(settings.outputs) >= model.n_outputs:
+        text = f"the {model.name} has {model.n_outputs} outputs"
+        raise DeviceError(card.name, f"{text}; set row_channel and column_channel to two of them")
+    is_streamed, (least_hz, fastest_hz) = settings.mode in ("fifo", "stream"), model.rate_hz
+    most_hz, rate_hz = model.fifo_rate_hz if is_streamed else fastest_hz, settings.sample_rate
+    if not least_hz <= rate_hz <= most_hz:
+        how = f" in mode: {settings.mode}" if is_streamed else ""
+        text = f"the {model.name} makes {least_hz / 1e6:g} to {most_hz / 1e6:g} MS/s{how}"
+        raise DeviceError(card.name, f"{text}; sample_rate is {rate_hz / 1e6:g} MHz")
+    spcm = card.spcm
+    mode = spcm.SPC_REP_FIFO_SINGLE if is_streamed else spcm.SPC_REP_STD_SINGLE
+    if not card.read(spcm.SPC_AVAILCARDMODES) & mode:
+        text = f"the {model.name} cannot play samples as it is (it lacks card mode {mode:#x})"
+        hint = "it needs the option AWG and its firmware, which Spectrum's Control Center switches on"
+        raise DeviceError(card.name, f"{text}; {hint}")
+    return model
+
+
+def read_model(card: AwgCard, device: str, named: str) -> Model:
+    """What the open card can do, as it reads itself.
+
+    Args:
+        card: The card.
+        device: Its device name.
+        named: Its model in the settings; "": any.
+
+    Raises:
+        DeviceError: It is another one, of another family, or has too few outputs.
+    """
+    spcm, product = card.spcm, card.product
+    n_outputs = card.read(spcm.SPC_MIINST_MODULES) * card.read(spcm.SPC_MIINST_CHPERMODULE)
+    code = card.read(spcm.SPC_PCITYP)
+    row = MODELS.get(model_name(code))
+    if row is None:
+        is_fast = code & spcm.TYP_FAMILYMASK == spcm.TYP_M5I63XX_X16 & spcm.TYP_FAMILYMASK
+        why = ": labseq does not know its steps of memory, amplifiers and delays" if is_fast else ""
+        text = f"the card '{device}' is a {product} with {n_outputs} outputs{why}"
+        raise DeviceError(card.name, f"{text}; expected {FAMILY_NAMES}: name another one as `card`")
+    if n_outputs < 2:
+        why = "both axes must be on one card, as labseq does not drive the star-hub that starts two together"
+        text = f"the card '{device}' is a {product} with one output; {why}"
+        raise DeviceError(card.name, f"{text}: use {FAMILY_NAMES}")
+    model = replace(
+        row,
+        name=product,
+        n_outputs=n_outputs,
+        rate_hz=(float(card.read(spcm.SPC_MIINST_MINADCLOCK)), float(card.read(spcm.SPC_MIINST_MAXADCLOCK))),
+        amplitude_mv=(card.read(spcm.SPC_READAOGAINMIN), card.read(spcm.SPC_READAOGAINMAX)),
+    )
+    actual = row.name + HIGH_BANDWIDTH * (model.relay_mv is None)
+    if named and named != actual:
+        raise DeviceError(card.name, f"the card '{device}' is a {actual}; the profile has model: {named}")
+    return model
 
 
 def set_up(card: AwgCard, settings: SpcmSettings, amplitude_mv: int) -> dict[str, Any]:
     """Set up everything that does not depend on the mode; returns facts about the card and its real rate."""
     card.command(card.spcm.M2CMD_CARD_RESET, "reset")
-    card.set(card.spcm.SPC_CHENABLE, 0b11, "active channels")
+    card.set(card.spcm.SPC_CHENABLE, sum(1 << channel for channel in card.outputs), "active channels")
     rate_hz = _set_clock(card, settings)
     _set_outputs(card, amplitude_mv)
     _set_trigger(card, settings)
@@ -72,27 +121,32 @@ def _version(card: AwgCard, register: int) -> str:
 
 
 def _set_clock(card: AwgCard, settings: SpcmSettings) -> float:
-    """Set the sample clock; returns the rate that it really makes, in Hz."""
+    """Set the sample clock; returns the rate that it really makes, in Hz.
+
+    It is written to the card here, with the outputs off, because the PLL may take 0.2 s to lock.
+    """
     spcm, reference_hz = card.spcm, settings.reference_clock
+    rate_hz, tolerance_hz = round(settings.sample_rate), limits.RATE_STEP_HZ
     if reference_hz is None:
         card.set(spcm.SPC_CLOCKMODE, spcm.SPC_CM_INTPLL, "clock mode")
     else:
         card.set(spcm.SPC_CLOCKMODE, spcm.SPC_CM_EXTREFCLOCK, "clock mode")
         card.set(spcm.SPC_REFERENCECLOCK, round(reference_hz), "reference clock in Hz")
-    rate_hz = round(settings.sample_rate)
-    return float(card.set(spcm.SPC_SAMPLERATE, rate_hz, "sample rate in Hz", limits.RATE_STEP_HZ))
+        tolerance_hz = round(limits.REFERENCE_TOLERANCE * rate_hz)
+    actual_hz = card.set(spcm.SPC_SAMPLERATE, rate_hz, "sample rate in Hz", tolerance_hz)
+    card.write_setup()
+    return float(actual_hz)
 
 
 def _set_outputs(card: AwgCard, amplitude_mv: int) -> None:
     """Relays open, then amplitude, 0 V when stopped, no filter."""
     spcm, zero = card.spcm, card.spcm.SPCM_STOPLVL_ZERO
-    switch_output(card, 0, on=False)
-    switch_output(card, 1, on=False)
+    for output in range(card.n_outputs):
+        switch_output(card, output, on=False)
     set_amplitude(card, amplitude_mv)
-    card.set(spcm.SPC_CH0_STOPLEVEL, zero, "output 0 when stopped")
-    card.set(spcm.SPC_CH1_STOPLEVEL, zero, "output 1 when stopped")
-    card.set(spcm.SPC_FILTER0, 0, "filter of output 0")
-    card.set(spcm.SPC_FILTER1, 0, "filter of output 1")
+    for output in card.outputs:
+        card.set(spcm.SPC_CH0_STOPLEVEL + output, zero, f"output {output} when stopped")
+        card.set(spcm.SPC_FILTER0 + NEXT_OUTPUT * output, 0, f"filter of output {output}")
 
 
 def _set_trigger(card: AwgCard, settings: SpcmSettings) -> None:
@@ -112,22 +166,22 @@ def _set_trigger(card: AwgCard, settings: SpcmSettings) -> None:
 
 def set_amplitude(card: AwgCard, amplitude_mv: int) -> None:
     """Set the amplitude of both outputs, also while they play."""
-    card.set(card.spcm.SPC_AMP0, amplitude_mv, "amplitude of output 0 in mV")
-    card.set(card.spcm.SPC_AMP1, amplitude_mv, "amplitude of output 1 in mV")
+    for output in card.outputs:
+        register = card.spcm.SPC_AMP0 + NEXT_OUTPUT * output
+        card.set(register, amplitude_mv, f"amplitude of output {output} in mV")
 
 
 def close_relays(card: AwgCard) -> bool:
     """Close the relays of both outputs; whether any was open, and has to settle now."""
-    spcm = card.spcm
-    if card.read(spcm.SPC_ENABLEOUT0) and card.read(spcm.SPC_ENABLEOUT1):
+    registers = [card.spcm.SPC_ENABLEOUT0 + NEXT_OUTPUT * output for output in card.outputs]
+    if all(card.read(register) for register in registers):
         return False
-    switch_output(card, 0, on=True)
-    switch_output(card, 1, on=True)
+    for output in card.outputs:
+        switch_output(card, output, on=True)
     card.write_setup()
     return True
 
 
-def switch_output(card: AwgCard, channel: int, *, on: bool) -> None:
+def switch_output(card: AwgCard, output: int, *, on: bool) -> None:
     """Close or open the relay of an output, with the next WRITESETUP or start."""
-    register = card.spcm.SPC_ENABLEOUT1 if channel else card.spcm.SPC_ENABLEOUT0
-    card.set(register, int(on), f"output {channel}")
+    card.set(card.spcm.SPC_ENABLEOUT0 + NEXT_OUTPUT * output, int(on), f"output {output}")

@@ -6,11 +6,12 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, field_validator, model_validator
 
-from labseq.plugin import Duration, Frequency, Settings, Voltage, format_quantity
+from labseq.plugin import Duration, FilePath, Frequency, Settings, Voltage, format_quantity
 from labseq_spcm import limits
+from labseq_spcm.models import ANY, MODELS, Model
 
 Mode: TypeAlias = Literal["sequence", "replay", "fifo", "stream"]
-Channel: TypeAlias = Literal[0, 1]
+Channel: TypeAlias = Literal[0, 1, 2, 3]
 
 NO_TRIGGER: Final = "takes no external trigger: a stream waits for nothing; use mode: sequence for it"
 
@@ -27,6 +28,31 @@ class KeepWarmSettings(Settings):
     )
 
 
+class CardFaults(Settings):
+    """What the simulated card does otherwise than the driver assumes; nothing by default."""
+
+    copies_samples: bool = Field(
+        default=False,
+        description="samples are copied when they are handed over, as with a NETBOX or a bounce buffer",
+    )
+    position_lag: Duration = Field(default=0.0, description="how late the position of a transfer is reported")
+    fifo_short: int = Field(
+        default=0, ge=0, description="bytes by which the card's buffer is smaller than its size"
+    )
+    pinning: Duration = Field(default=0.0, description="time to name a transfer buffer")
+    underrun_not_ready: bool = Field(
+        default=False, description="a card that ran dry reports the overrun, but not that it is ready"
+    )
+    slow_small_blocks: bool = Field(
+        default=False, description="small notify sizes slow the bus down, as in the manual's table"
+    )
+    first_contact: FilePath | None = Field(
+        default=None,
+        description="file of `labseq first-contact`: the simulated card does what was measured there; none: "
+        "what the driver assumes",
+    )
+
+
 class SpcmSettings(Settings):
     """Mobile tweezers on a Spectrum M4i.66xx."""
 
@@ -34,6 +60,11 @@ class SpcmSettings(Settings):
         default="/dev/spcm0",
         min_length=1,
         description="device name in the vendor's driver; `simulated` for a card that exists only in software",
+    )
+    model: str = Field(
+        default="",
+        description="product name that the card must have, such as M4i.6631-x8, or M4i.6631-x8-hbw with that "
+        "option, to check its limits before it is opened; none: any",
     )
     serial: int = Field(default=0, ge=0, description="serial number that the card must have; 0: any")
     mode: Mode = Field(
@@ -45,8 +76,9 @@ class SpcmSettings(Settings):
     sample_rate: Frequency = Field(
         default=625e6, description="samples per second; the card rounds it to 8 Hz"
     )
-    row_channel: Channel = Field(
-        default=0, description="output that drives the row axis; the other one drives the column axis"
+    row_channel: Channel = Field(default=0, description="output that drives the row axis")
+    column_channel: Channel | None = Field(
+        default=None, description="output that drives the column axis; none: the other one of 0 and 1"
     )
     trigger: Literal["software", "external"] = Field(
         default="software",
@@ -84,19 +116,45 @@ class SpcmSettings(Settings):
         "programs begin at multiples of it",
     )
     card_buffer: int = Field(
-        default=1 << 16,
-        ge=1 << 12,
+        default=1 << 17,
+        ge=1 << 13,
         le=1 << 24,
-        description="stream: bytes of on-board memory that are used, a power of two, at least notify_size",
+        description="stream: bytes of on-board memory that are used, a power of two, at least 2 notify_size",
+    )
+    faults: CardFaults = Field(
+        default=CardFaults(), description="what the simulated card does otherwise than a real one should"
     )
     keep_warm: KeepWarmSettings | None = Field(
         default=None, description="sequence and stream: tones off the atoms between programs; none: silence"
     )
 
+    @field_validator("model")
+    @classmethod
+    def _check_model(cls, name: str) -> str:
+        if name and name not in MODELS:
+            raise ValueError(f"expected one of {', '.join(MODELS)}")
+        return name
+
+    @property
+    def limits(self) -> Model:
+        """What the card can do, as far as the profile names it."""
+        return MODELS.get(self.model, ANY)
+
+    @property
+    def outputs(self) -> tuple[int, int]:
+        """The outputs of rows and columns."""
+        column = 1 - self.row_channel if self.column_channel is None else self.column_channel
+        return self.row_channel, column
+
+    @property
+    def row_index(self) -> int:
+        """Place of the row axis in each pair of samples: the card takes its outputs in ascending order."""
+        return int(self.outputs[0] > self.outputs[1])
+
     @field_validator("sample_rate")
     @classmethod
     def _check_rate(cls, rate_hz: float) -> float:
-        low, high = limits.SAMPLE_RATE_HZ
+        low, high = ANY.rate_hz
         if not low <= rate_hz <= high:
             raise ValueError(f"expected {_hz(low)} to {_hz(high)}")
         for start, end in limits.RATE_GAPS_HZ:
@@ -111,9 +169,33 @@ class SpcmSettings(Settings):
         return () if self.card == "simulated" else (f"Spectrum {self.card}", *serial)
 
     @model_validator(mode="after")
+    def _check_outputs(self) -> Self:
+        row, column = self.outputs
+        if column < 0:
+            raise ValueError(
+                f"row_channel is {row}; expected column_channel, which is only left out for 0 and 1"
+            )
+        if row == column:
+            raise ValueError(f"row_channel and column_channel are both {row}; expected two outputs")
+        if self.model and max(row, column) >= self.limits.n_outputs:
+            n_outputs = self.limits.n_outputs
+            raise ValueError(
+                f"the {self.model} has {n_outputs} outputs; expected row_channel and column_channel of them"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _check_bus_rate(self) -> Self:
-        if self.mode in ("fifo", "stream") and self.sample_rate > limits.FIFO_RATE_HZ:
-            rate, most = _hz(self.sample_rate), _hz(limits.FIFO_RATE_HZ)
+        if self.mode not in ("fifo", "stream"):
+            return self
+        if self.card.upper().startswith("TCPIP"):
+            needed = f"{limits.FRAME_BYTES * self.sample_rate / 1e9:.2g} GB/s"
+            raise ValueError(
+                f"mode: {self.mode} needs {needed}, which the network to {self.card} does not carry; "
+                "use mode: replay"
+            )
+        if self.sample_rate > self.limits.fifo_rate_hz:
+            rate, most = _hz(self.sample_rate), _hz(self.limits.fifo_rate_hz)
             raise ValueError(
                 f"sample_rate is {rate}, but the bus carries at most {most} on two channels; lower it, or "
                 "use mode: sequence"
@@ -138,10 +220,10 @@ class SpcmSettings(Settings):
             return self
         if self.trigger == "external":
             raise ValueError(f"mode: stream {NO_TRIGGER}")
-        if self.card_buffer < self.notify_size:
-            raise ValueError(
-                f"card_buffer is {self.card_buffer}; expected at least notify_size, {self.notify_size}"
-            )
+        if self.card_buffer < 2 * self.notify_size:
+            least = f"at least twice notify_size, {2 * self.notify_size}"
+            why = "the card reports whole blocks, and is started when it has one"
+            raise ValueError(f"card_buffer is {self.card_buffer}; expected {least}: {why}")
         least_s = self._buffered_s(self.sample_rate)
         if self.look_ahead is not None and self.look_ahead < least_s:
             look_ahead, least = (format_quantity(s, "time") for s in (self.look_ahead, least_s))

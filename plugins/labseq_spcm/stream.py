@@ -35,7 +35,10 @@ BEGINNING_S: Final = 1e-3
 """A program is cut after that time: making the rest takes less, even if the computer is busy."""
 TRIES: Final = 5
 BUS_SAMPLES: Final = 1 << 22
-"""Samples that are sent to measure the speed of the bus: 6 ms at 2.8 GB/s."""
+"""Most samples that are sent to measure the speed of the bus: 6 ms at 2.8 GB/s."""
+PCIE_BYTES_PER_S: Final = {1: 0.175e9, 2: 0.35e9, 3: 0.69e9}
+"""What a lane of a generation carries to the card: 70 % of its bits, as in the manual's 2.8 GB/s over eight
+lanes of generation 2 (with payloads of 256 bytes); later ones at least as much as the third."""
 
 
 def check_rendering(name: str, context: Context, sample_rate_hz: float, row_channel: int) -> None:
@@ -147,6 +150,7 @@ class Stream(PlayMode):
     Attributes:
         n_underruns: How often the card ran dry in silence, and was started again.
         delay_s: From ``start`` to the first sample at the output, at most.
+        bus_bytes_per_s: What the bus carries, as measured.
 
     Raises:
         DeviceError: The bus is too slow for the sample rate.
@@ -160,10 +164,11 @@ class Stream(PlayMode):
     ) -> None:
         super().__init__(card)
         self._rate_hz = sample_rate_hz
-        self._row_channel = settings.row_channel
+        self._row_channel = settings.row_index
         self._block = block = settings.notify_size // FRAME_BYTES
         self._on_card = (settings.card_buffer + OUTPUT_FIFO_BYTES) // FRAME_BYTES
-        self._to_start = settings.card_buffer // FRAME_BYTES // block * block
+        # a block less than the whole: the card may keep some bytes for itself, and reports whole blocks
+        self._to_start = settings.card_buffer // FRAME_BYTES // block * block - block
         ahead = settings.look_ahead_s(sample_rate_hz) * sample_rate_hz - self._on_card
         self._ahead = max(2, int(ahead / block)) * block
         self.delay_s = (self._ahead + self._on_card) / sample_rate_hz
@@ -172,7 +177,7 @@ class Stream(PlayMode):
         self._ring = Buffer().reserve(n_samples)
         self._silence = np.zeros((block, 2), np.int16)
         if keep_warm is not None:
-            self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_channel, block)
+            self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_index, block)
         self._ring.reshape(-1, block, 2)[:] = self._silence
         # for what is rendered between `prepare` and `start`: at most 0.8 ms at 625 MS/s
         self._ready = [Buffer().reserve(1 << 19) for _ in range(3)]
@@ -180,6 +185,7 @@ class Stream(PlayMode):
             frames[:] = 0  # so that the memory is there
         self._scratch = new_scratch()
         self._workspaces: dict[tuple[int, int], Any] = {}
+        self._timer = new_timer()
         self._lock = threading.RLock()
         self._stop = threading.Event()
         self._signals: tuple[WakeSignal, ...] = ()  # of the loop, and of its helper
@@ -189,7 +195,7 @@ class Stream(PlayMode):
         self._alive = deque[Program](maxlen=2 * k.N_QUEUE)  # the loop may still use earlier ones
         self._box = self._new_box()
         self.n_underruns = self._n_pauses = 0
-        self._check_bus()
+        self.bus_bytes_per_s = self._check_bus()
         self._set_mode(settings)
 
     def _new_box(self) -> NDArray[np.int64]:
@@ -206,22 +212,34 @@ class Stream(PlayMode):
         box[k.START_COMMAND] = start
         return box
 
-    def _check_bus(self) -> None:
-        """Time transfers to the card's memory; the fastest counts."""
-        card, spcm, frames = self._card, self._card.spcm, Buffer().reserve(BUS_SAMPLES)
+    def _check_bus(self) -> float:
+        """Check that the bus carries the stream; returns its speed in bytes per second.
+
+        First what the slot is, as the card reads it, then transfers of two sizes to its memory: from one to
+        the other nothing counts but the samples. Of each size the fastest counts.
+
+        Raises:
+            DeviceError: It is too slow.
+        """
+        card, spcm, needed = self._card, self._card.spcm, FRAME_BYTES * self._rate_hz
+        generation, lanes = card.read(spcm.SPC_PCIEXPGENERATION), card.read(spcm.SPC_PCIEXPLANES)
+        slot = lanes * PCIE_BYTES_PER_S.get(generation, PCIE_BYTES_PER_S[3])
+        if slot < needed:
+            raise self._too_slow(f"the slot has {lanes} lanes of PCIe generation {generation}: it", slot)
+        frames, sizes = Buffer().reserve(BUS_SAMPLES), (BUS_SAMPLES // 4, BUS_SAMPLES)
         card.set(spcm.SPC_MEMSIZE, BUS_SAMPLES, "memory size")
-        took_s, needed = math.inf, FRAME_BYTES * self._rate_hz
-        for _ in range(2 * TRIES):
-            start_s = card.clock.now()
-            card.upload(frames, poll_s=20e-6)
-            took_s = min(took_s, card.clock.now() - start_s)
-            if took_s <= frames.nbytes / needed:
-                return
-        speed, most_hz = frames.nbytes / took_s, frames.nbytes / took_s / FRAME_BYTES
-        rate, most = (format_quantity(hz, "frequency") for hz in (self._rate_hz, most_hz))
-        text = f"the bus carries {speed / 1e9:.3g} GB/s, but mode: stream at {rate} needs"
+        took_s = [min(card.upload(frames[:n], poll_s=20e-6) for _ in range(TRIES)) for n in sizes]
+        speed = FRAME_BYTES * (sizes[1] - sizes[0]) / max(took_s[1] - took_s[0], 1e-9)
+        if speed < needed:
+            raise self._too_slow("the bus", speed)
+        return speed
+
+    def _too_slow(self, what: str, bytes_per_s: float) -> DeviceError:
+        rate, most = (format_quantity(hz, "frequency") for hz in (self._rate_hz, bytes_per_s / FRAME_BYTES))
+        needed = FRAME_BYTES * self._rate_hz
+        text = f"{what} carries {bytes_per_s / 1e9:.3g} GB/s, but mode: stream at {rate} needs"
         hint = f"use a slot with more lanes, a sample_rate below {most}, or mode: replay"
-        raise DeviceError(card.name, f"{text} {needed / 1e9:.3g} GB/s; {hint}")
+        return DeviceError(self._card.name, f"{text} {needed / 1e9:.3g} GB/s; {hint}")
 
     def _set_mode(self, settings: SpcmSettings) -> None:
         card, spcm = self._card, self._card.spcm
@@ -242,6 +260,7 @@ class Stream(PlayMode):
             self._is_on, self._stop = True, threading.Event()
         self._has_thread = not self._card.library.call_in_virtual_time(self._virtual_step)
         if self._has_thread:
+            self._box[k.LOCK], self._box[k.TIMER] = self._card.lock.word.ctypes.data, self._timer.ctypes.data
             threads = [("spcm stream", self._run)] + [("spcm helper", self._help)] * (n_cores() > 1)
             self._signals = tuple(WakeSignal() for _ in threads)
             for (name, target), signal in zip(threads, self._signals, strict=True):
@@ -351,7 +370,7 @@ class Stream(PlayMode):
     ) -> None:
         """The thread that supplies the card."""
         raise_priority(above=2)  # so that the card does not run dry because other threads are busy
-        timer, rate_hz, code = new_timer(), int(self._rate_hz), 0
+        timer, rate_hz, code = self._timer, int(self._rate_hz), 0
         while (pause_s := self._step(box, code)) is not None:
             if pause_s:
                 stop.wait(pause_s)
@@ -364,6 +383,7 @@ class Stream(PlayMode):
         pause_s = self._step(self._box, 0)
         if pause_s != 0.0:
             return pause_s
+        self._box[k.NOW_NS] = round(1e9 * self._card.library.step_time_s())
         code = k.supply(self._box, int(self._rate_hz))
         return self._step(self._box, code) if code < 0 else 1e-9 * code
 
@@ -405,19 +425,22 @@ class Stream(PlayMode):
 
     def _error(self) -> DeviceError:
         """The error that the library reported to the loop."""
-        return DeviceError(self._card.name, f"supplying the card: {self._card.clear_error()}")
+        reason = self._card.clear_error(int(self._box[k.ERROR]))
+        return DeviceError(self._card.name, f"supplying the card: {reason}")
 
     def _recover(self, code: int) -> None:
         """The card ran dry, or was too fast: begin again, with the program if it cannot have begun.
 
         Raises:
             TransientError: In the middle of a program.
-            DeviceError: The card runs, but the library reports an error.
+            DeviceError: The card runs, but the library reports an error; or it does not fetch samples.
         """
-        box = self._box
+        box, card = self._box, self._card
+        if code == k.STUCK:
+            raise card.not_fetched(int(box[k.FETCHED]) * FRAME_BYTES, int(box[k.TO_START]) * FRAME_BYTES)
         if code == k.FAILED:
             error = self._error()
-            if self._card.running or box[k.IS_FILLING]:
+            if box[k.IS_FILLING] or (card.running and not card.ran_dry):
                 raise error
             if k.look(box) == k.FAILED:
                 raise self._error()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from labseq.plugin import const, helper_kernel, kernel
 from labseq.plugin.native import (
     N_SIGNAL,
+    N_TIMER,
     call_c,
     carray,
     now_ns,
@@ -26,7 +27,7 @@ from labseq.plugin.native import (
     swap,
     wait_signal,
 )
-from labseq_spcm.kernels import interleave
+from labseq_spcm.kernels import give, interleave, take
 from labseq_spcm.limits import FRAME_BYTES
 
 Words = NDArray[np.int64]
@@ -37,8 +38,8 @@ TONES: Final = f"{const('int32', 1)}, {const('float64', 1)}, {const('float64', 1
 
 COMMAND, STATUS, USER_LEN, CARD_LEN = 100, 110, 200, 202
 """M2CMD, M2STATUS, DATA_AVAIL_USER_LEN and DATA_AVAIL_CARD_LEN, as in the vendor's header files."""
-READY: Final = 0x4
-"""M2STAT_CARD_READY: it does not run."""
+ENDED: Final = 0x4 | 0x400
+"""M2STAT_CARD_READY or M2STAT_DATA_OVERRUN: it does not run, or ran dry, after which it need not be ready."""
 
 (GET, SET, HANDLE, RENDER, RING, N_RING, BLOCK, ON_CARD, AHEAD, SILENCE, SCRATCH, VALUE) = range(12)
 """Set before the loop: the library's functions and the card's handle, :func:`render_address`,
@@ -62,9 +63,12 @@ and how much the card fetched meanwhile."""
 (HELPER, POSTED, DONE, HELP_AXIS, HELP_START, HELP_OUT) = range(35, 41)
 """Address of the signal for :func:`assist` in another thread, 0 if there is none; a part of the column axis
 that waits to be rendered and one that was, and which: the arguments of RENDER."""
-(IS_FILLING, TO_START, START_COMMAND) = range(41, 44)
-"""Whether the card is filled before its start, the samples that it must have fetched then, and the M2CMD."""
-N_WORDS: Final = 44
+(LOCK, TIMER) = range(46, 48)
+"""Addresses of the lock of the library's calls, 0 where a call is what calls the loop; and of its timer."""
+(IS_FILLING, TO_START, START_COMMAND, NOW_NS, FILLED_BY_NS) = range(41, 46)
+"""Whether the card is filled before its start, the samples that it must have fetched then, the M2CMD, the
+time of this step, and when the filling must be over."""
+N_WORDS: Final = 48
 
 LENGTH, ROW_CHANNEL, CUTS, N_CUTS, READY_MADE, ROOM, AXES, N_AXIS, BASE, N_READY, BEGAN = range(11)
 """Words of a program: samples in whole blocks, output of the row axis, address and number of the samples
@@ -81,6 +85,8 @@ MOST_SAMPLES: Final = 1 << 17
 """Samples written at a time, 0.2 ms at 625 MS/s, if there is room: the loop looks for STOP after them."""
 FILLING_POLL_NS: Final = 20_000
 """Time between two looks at a card that is filled before its start."""
+FILLING_NS: Final = 1_000_000_000
+"""How long that may take."""
 POLL_NS: Final = 1_000_000
 """Longest time between two looks at the ring while a program plays."""
 SPIN_NS: Final = 50_000
@@ -90,9 +96,9 @@ HELP_POLL_NS: Final = 100_000
 WAIT_MS: Final = 100
 """Longest wait for a signal."""
 
-STOPPED, DRY, FAILED, LATE = -1, -2, -3, -4
+STOPPED, DRY, FAILED, LATE, STUCK = -1, -2, -3, -4, -5
 """The driver asked for the end; the card has stopped; the library reports an error; the card may have fetched
-samples before they were written."""
+samples before they were written; it did not fetch enough samples to be started."""
 
 
 @kernel(f"int64({const('int64', 1)}, {TONES}, {TONES}, int64[::1])")
@@ -123,18 +129,28 @@ def find_cuts(
     return n
 
 
+@helper_kernel("int64(int64[::1], int64, int64, int64)")
+def call_library(box: Words, function: int, register: int, value: int) -> int:
+    """Call one of the library's functions when nobody else does; returns its error code."""
+    if box[LOCK]:
+        take(box[LOCK], carray(pointer(box[TIMER]), N_TIMER, np.int64))
+    box[ERROR] = call_c(function, box[HANDLE], register, value)
+    if box[LOCK]:
+        give(box[LOCK])
+    return box[ERROR]  # pyright: ignore[reportReturnType]
+
+
 @helper_kernel("int64(int64[::1], int64)")
 def read(box: Words, register: int) -> int:
     """A register of the card; FAILED if the library reports an error."""
-    box[ERROR] = call_c(box[GET], box[HANDLE], register, box[VALUE])
+    call_library(box, box[GET], register, box[VALUE])
     return FAILED if box[ERROR] else box[FOUND]  # pyright: ignore[reportReturnType]
 
 
 @helper_kernel("int64(int64[::1], int64)")
 def hand_over(box: Words, n_samples: int) -> int:
     """Let the card fetch samples that are in the ring; returns 0 or FAILED."""
-    box[ERROR] = call_c(box[SET], box[HANDLE], CARD_LEN, n_samples * FRAME_BYTES)
-    if box[ERROR]:
+    if call_library(box, box[SET], CARD_LEN, n_samples * FRAME_BYTES):
         return FAILED
     box[WRITTEN] += n_samples
     return 0
@@ -248,7 +264,7 @@ def look(box: Words) -> int:
     status = read(box, STATUS)
     if status < 0:
         return FAILED
-    return DRY if status & READY else in_ring  # pyright: ignore[reportReturnType]
+    return DRY if status & ENDED else in_ring  # pyright: ignore[reportReturnType]
 
 
 @helper_kernel("boolean(int64[::1], int64[::1], int64)")
@@ -321,16 +337,23 @@ def is_in_time(box: Words) -> bool:
     return left >= 0  # pyright: ignore[reportReturnType]
 
 
+@helper_kernel("int64(int64[::1])")
+def start_when_filled(box: Words) -> int:
+    """Start the card once it has fetched enough; returns after how many ns to look again, or a code."""
+    if box[FETCHED] < box[TO_START]:
+        if box[FILLED_BY_NS] == 0:
+            box[FILLED_BY_NS] = box[NOW_NS] + FILLING_NS
+        return STUCK if box[NOW_NS] > box[FILLED_BY_NS] else FILLING_POLL_NS
+    box[IS_FILLING] = box[FILLED_BY_NS] = 0
+    return FAILED if call_library(box, box[SET], COMMAND, box[START_COMMAND]) else 0
+
+
 @kernel("int64(int64[::1], int64)")
 def supply(box: Words, rate_hz: int) -> int:
     """One step: write what there is room for; returns after how many ns that is due again, or a code."""
     in_ring = look(box)
     if box[IS_FILLING] and in_ring != FAILED:
-        if box[FETCHED] < box[TO_START]:
-            return FILLING_POLL_NS
-        box[IS_FILLING] = 0
-        box[ERROR] = call_c(box[SET], box[HANDLE], COMMAND, box[START_COMMAND])
-        return FAILED if box[ERROR] else 0
+        return start_when_filled(box)  # pyright: ignore[reportReturnType]
     if in_ring < 0:
         return in_ring
     if box[RENDERED_AT] >= 0:
@@ -362,6 +385,7 @@ def feed(box: Words, rate_hz: int, timer: Words, signal: Words) -> int:
     box[IS_FEEDING] = 1
     code = STOPPED
     while box[STOP] == 0:
+        box[NOW_NS] = now_ns(timer)
         code = supply(box, rate_hz)
         if code < 0:
             break

@@ -10,19 +10,25 @@ The driver ``labseq_spcm`` opens it as a :class:`SimulatedLibrary` where a profi
 """
 
 from labseq_spcm_sim.card import LogEntry, SimulatedCard
+from labseq_spcm_sim.faults import Faults
 from labseq_spcm_sim.library import CardOutputs, SimulatedLibrary, install, installed, vendor_library_found
+from labseq_spcm_sim.measured import card_with
 from labseq_spcm_sim.output import SampleSpan
-from labseq_spcm_sim.setup import M4I6631, CardModel, ErrorInfo, trigger_delay_s
+from labseq_spcm_sim.setup import M4I6621, M4I6622, M4I6631, CardModel, ErrorInfo, trigger_delay_s
 
 __all__ = [
+    "M4I6621",
+    "M4I6622",
     "M4I6631",
     "CardModel",
     "CardOutputs",
     "ErrorInfo",
+    "Faults",
     "LogEntry",
     "SampleSpan",
     "SimulatedCard",
     "SimulatedLibrary",
+    "card_with",
     "install",
     "installed",
     "trigger_delay_s",

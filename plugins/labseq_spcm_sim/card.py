@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import mmap
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.plugin import Clock
+from labseq.plugin import Clock, StopRequested
 from labseq_spcm_sim import registers as r
+from labseq_spcm_sim.faults import COPY_BYTES_PER_S, Faults
 from labseq_spcm_sim.machine import Machine
 from labseq_spcm_sim.modes import Buffer
 from labseq_spcm_sim.output import SampleSpan
@@ -52,6 +55,7 @@ class SimulatedCard:
         serial_number: Its serial number.
         keep_history: Keep what was played until ``forget``; otherwise each start of the card drops it, and
             nothing of a stream is kept.
+        faults: What it does otherwise than by default.
 
     Attributes:
         log: The latest register writes, in order.
@@ -72,13 +76,16 @@ class SimulatedCard:
         model: CardModel = M4I6631,
         serial_number: int = 12345,
         keep_history: bool = True,
+        faults: Faults = Faults(),  # noqa: B008 - frozen
     ) -> None:
         self.model = model
         self.log: deque[LogEntry] = deque(maxlen=LOG_SIZE)
         self._clock = clock
         self._keep_history = keep_history
         self._lock = threading.RLock()
-        self._machine = Machine(model, keeps_streams=keep_history)
+        self._machine = Machine(model, keeps_streams=keep_history, faults=faults)
+        self._faults = faults
+        self._continuous: mmap.mmap | None = None
         self._error = ErrorInfo()
         self._edges_s: list[float] = []
         self._step: Callable[[], float | None] | None = None
@@ -160,10 +167,10 @@ class SimulatedCard:
             return self._machine.running
 
     @property
-    def outputs_on(self) -> tuple[bool, bool]:
-        """Whether the output relays of the two channels are closed."""
+    def outputs_on(self) -> tuple[bool, ...]:
+        """Whether the output relay of each channel is closed."""
         with self._lock:
-            return self._machine.amplifiers[0].enabled, self._machine.amplifiers[1].enabled
+            return tuple(amplifier.enabled for amplifier in self._machine.amplifiers)
 
     # Functions of the driver library; most return the vendor's error code
 
@@ -179,6 +186,11 @@ class SimulatedCard:
             self._machine.stop_dma(self._advance())
             self._machine.buffer = None
             self._is_open = False
+
+    @property
+    def step_time_s(self) -> float:
+        """The time of the step that is being called, else that of the clock."""
+        return self._now()
 
     def _now(self) -> float:
         return self._clock.now() if self._within_step_s is None else self._within_step_s
@@ -225,10 +237,25 @@ class SimulatedCard:
 
     def write(self, register: int, value: Number) -> int:
         """Write one register."""
+        if register == r.SPC_DATA_AVAIL_CARD_LEN and self._faults.copies_samples:
+            self._take(int(value) / COPY_BYTES_PER_S)
         return self.write_all([(register, value)])
+
+    def _take(self, duration_s: float) -> None:
+        """Take the time that a call takes."""
+        with suppress(StopRequested):  # nothing may pass through C; the caller's next wait raises it
+            self._clock.sleep(duration_s)
 
     def write_all(self, writes: Iterable[tuple[int, Number]]) -> int:
         """Write registers one after the other, up to the first that is refused."""
+        code = self._write_all(writes)
+        busy_s, self._machine.busy_s = self._machine.busy_s, 0.0
+        if busy_s:
+            with suppress(StopRequested):  # nothing may pass through C; the caller's next wait raises it
+                self._clock.sleep(busy_s)
+        return code
+
+    def _write_all(self, writes: Iterable[tuple[int, Number]]) -> int:
         with self._lock:
             if self._error.code:
                 return r.ERR_LASTERR
@@ -258,6 +285,7 @@ class SimulatedCard:
 
     def define_transfer(self, kind: int, direction: int, offset: int, buffer: Buffer) -> int:
         """Name the buffer of the next transfer."""
+        self._take(self._faults.pinning_s)
         with self._lock:
             if self._error.code:
                 return r.ERR_LASTERR
@@ -268,6 +296,14 @@ class SimulatedCard:
             except Refusal as refusal:
                 return self._refused(refusal, 0, buffer.n_bytes)
             return r.ERR_OK
+
+    def continuous_buffer(self) -> tuple[int, int]:
+        """Address and length of the driver's continuous buffer; 0 and 0 if none was set up."""
+        n_bytes = self.model.continuous_bytes
+        if n_bytes and self._continuous is None:
+            self._continuous = mmap.mmap(-1, n_bytes)
+            self._machine.continuous = np.frombuffer(self._continuous, np.uint8).ctypes.data
+        return self._machine.continuous, n_bytes
 
     def invalidate(self) -> int:
         """Forget the transfer buffer; the manual wants the transfer stopped by a command before."""

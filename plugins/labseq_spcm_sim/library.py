@@ -229,8 +229,14 @@ class Library:
     _dwgeterrorinfo_i64 = partialmethod(_take_error, ctypes.c_int64)
     _dwgeterrorinfo_d64 = partialmethod(_take_error, ctypes.c_double)
 
-    def _dwgetcontbuf_i64(self, _handle: int | None, _kind: int, _out: int, _length: int) -> int:
-        return r.ERR_FNCNOTSUPPORTED
+    def _dwgetcontbuf_i64(self, handle: int | None, _kind: int, out: int, length: int) -> int:
+        card = self._open.get(handle or 0)
+        if card is None:
+            return r.ERR_INVALIDHANDLE
+        address, n_bytes = card.continuous_buffer()
+        _put_number(ctypes.c_int64, out, address)
+        _put_number(ctypes.c_int64, length, n_bytes)
+        return r.ERR_OK
 
     def _dwdiscovery(self, *_: Any) -> int:
         return r.ERR_OK
@@ -266,14 +272,26 @@ class SimulatedLibrary:
             :func:`install` made available.
         clock: The session's time.
         simulation: Receives what the card plays, if it implements ``ReceivesOutput``.
-        row_channel: Channel that drives the row axis; the other drives the columns.
+        row_channel: Channel that drives the row axis.
+        column_channel: Channel that drives the columns; None: the other one of 0 and 1.
+        new_card: Makes the card; takes the arguments of :class:`SimulatedCard`.
 
     Attributes:
         card: The new card in this process, while connected.
     """
 
-    def __init__(self, name: str, clock: Clock, simulation: Simulation | None, row_channel: int) -> None:
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        simulation: Simulation | None,
+        row_channel: int,
+        column_channel: int | None = None,
+        new_card: Callable[..., SimulatedCard] = SimulatedCard,
+    ) -> None:
         self._name = name
+        self._new_card = new_card
+        self._column_channel = column_channel
         self._clock = clock
         self._simulation = simulation
         self._row_channel = row_channel
@@ -295,7 +313,7 @@ class SimulatedLibrary:
         if self._name != PREFIX:
             return self._name
         received = isinstance(self._simulation, ReceivesOutput)
-        self.card = card = SimulatedCard(self._clock, keep_history=received)
+        self.card = card = self._new_card(self._clock, keep_history=received)
         self.wire(card)
         return install(card)
 
@@ -304,7 +322,8 @@ class SimulatedLibrary:
         if self._simulation is not None:
             self._simulation.wire("mobile_tweezers", lambda t_s, _width_s: card.trigger_at(t_s))
         if isinstance(self._simulation, ReceivesOutput):
-            self._simulation.connect_outputs("mobile_tweezers", CardOutputs(card, self._row_channel))
+            outputs = CardOutputs(card, self._row_channel, self._column_channel)
+            self._simulation.connect_outputs("mobile_tweezers", outputs)
 
     def disconnect(self) -> None:
         """Remove the card."""
@@ -329,7 +348,12 @@ class SimulatedLibrary:
         card.call(step)
         return True
 
-    def emergency(self, script: Path) -> Emergency | None:  # noqa: ARG002 - for a real card
+    def step_time_s(self) -> float:
+        """The time of the step that is being called, which may be earlier than that of the clock."""
+        card = self.card or _library().cards[self._name]
+        return card.step_time_s
+
+    def emergency(self, script: Path, n_outputs: int) -> Emergency | None:  # noqa: ARG002 - for a real card
         """None: the card is in this process, and dies with it."""
         return None
 
@@ -341,12 +365,13 @@ class CardOutputs:
 
     Args:
         card: The card.
-        row_channel: Channel that drives the row axis; the other drives the columns.
+        row_channel: Channel that drives the row axis.
+        column_channel: Channel that drives the columns; None: the other one of 0 and 1.
     """
 
-    def __init__(self, card: SimulatedCard, row_channel: int) -> None:
+    def __init__(self, card: SimulatedCard, row_channel: int, column_channel: int | None = None) -> None:
         self._card = card
-        self._channels = row_channel, 1 - row_channel
+        self._channels = row_channel, 1 - row_channel if column_channel is None else column_channel
         self._reported_s = -math.inf
 
     def played(self, until_s: float) -> tuple[list[RfSpan], list[RfSpan]]:

@@ -7,13 +7,23 @@ from dataclasses import dataclass
 from typing import Final
 
 from labseq_spcm_sim import registers as r
+from labseq_spcm_sim.faults import Faults
 from labseq_spcm_sim.modes import Buffer, Fifo, Memory, Replay, Run, Stretch
 from labseq_spcm_sim.output import Amplifier, SampleSpan
 from labseq_spcm_sim.sequence import REGISTERS, SequenceMemory, SequenceRun
-from labseq_spcm_sim.setup import UNKNOWN, CardModel, Number, Refusal, Setup, refuse, trigger_delay_s
+from labseq_spcm_sim.setup import (
+    AMPLITUDES,
+    OUTPUTS,
+    PLL_LOCK_S,
+    UNKNOWN,
+    CardModel,
+    Number,
+    Refusal,
+    Setup,
+    refuse,
+    trigger_delay_s,
+)
 
-AMPLITUDES: Final = {r.SPC_AMP0: 0, r.SPC_AMP1: 1}
-OUTPUTS: Final = {r.SPC_ENABLEOUT0: 0, r.SPC_ENABLEOUT1: 1}
 WAITS: Final = r.M2CMD_CARD_WAITTRIGGER | r.M2CMD_CARD_WAITREADY | r.M2CMD_DATA_WAITDMA
 
 
@@ -43,18 +53,24 @@ class Machine:
     Args:
         model: What card it is.
         keeps_streams: Whether samples of streams are kept, not only those of replays.
+        faults: What it does otherwise than by default.
+
+    Attributes:
+        continuous: Address of the driver's continuous buffer, whose length the model has.
     """
 
-    def __init__(self, model: CardModel, *, keeps_streams: bool) -> None:
+    def __init__(self, model: CardModel, *, keeps_streams: bool, faults: Faults = Faults()) -> None:  # noqa: B008
         self.model = model
+        self._faults = faults
+        self.continuous = 0
         self._keeps_streams = keeps_streams
-        self.amplifiers = (Amplifier(model), Amplifier(model))
+        self.amplifiers = tuple(Amplifier(model) for _ in range(model.n_channels))
         self.samples: list[Record] = []
         self._power_on()
 
     def _power_on(self) -> None:
         self.setup = Setup(self.model)
-        self.memory = Memory(self.model.bus_bytes_per_s)
+        self.memory = Memory()
         self.buffer: Buffer | None = None
         self.fifo: Fifo | None = None
         self.run: Run | None = None
@@ -63,6 +79,7 @@ class Machine:
         self.trigger_enabled = False
         self.underrun = False
         self.free_bytes = 0
+        self.busy_s = 0.0  # how much longer the last command takes
 
     def advance(self, now_s: float) -> None:
         """Do everything that is due, in time's order."""
@@ -78,6 +95,7 @@ class Machine:
             if self.run.finished or self.run.failed:
                 self.underrun = self.run.failed
                 self._end_run(now_s)
+                self.running = self.underrun and self._faults.underrun_not_ready
 
     def _end_run(self, now_s: float) -> None:
         self.samples += self._run_samples(now_s)
@@ -149,8 +167,8 @@ class Machine:
         """The memory is divided in the mode STD_SEQUENCE, and whole in the others."""
         if (mode == r.SPC_REP_STD_SEQUENCE) != isinstance(self.memory, SequenceMemory):
             is_divided = mode == r.SPC_REP_STD_SEQUENCE
-            n_channels, bus = len(self.setup.channels), self.model.bus_bytes_per_s
-            self.memory = SequenceMemory(self.model, n_channels) if is_divided else Memory(bus)
+            n_channels = len(self.setup.channels)
+            self.memory = SequenceMemory(self.model, n_channels) if is_divided else Memory()
 
     @property
     def _sequence_memory(self) -> SequenceMemory:
@@ -205,8 +223,7 @@ class Machine:
         if command & r.M2CMD_DATA_STARTDMA:
             self._start_dma(now_s)
         if command & r.M2CMD_CARD_START:
-            self._start()
-            self._write_setup(now_s)
+            self._start(now_s)
         if command & r.M2CMD_CARD_ENABLETRIGGER:
             self.trigger_enabled = self.running
         if command & r.M2CMD_CARD_FORCETRIGGER:
@@ -218,9 +235,11 @@ class Machine:
 
     def _write_setup(self, now_s: float) -> None:
         """The set-up is written to the card: its relays follow the registers."""
-        self.setup.write_to_card()
+        if self.setup.write_to_card():
+            self.busy_s = PLL_LOCK_S
         for register, channel in OUTPUTS.items():
-            self.amplifiers[channel].enable(bool(self.setup[register]), now_s)
+            if channel < self.model.n_channels:
+                self.amplifiers[channel].enable(bool(self.setup[register]), now_s)
 
     def _reset(self, now_s: float) -> None:
         """Everything as after power-on, outputs off."""
@@ -231,9 +250,10 @@ class Machine:
             amplifier.set_amplitude(1000, now_s)
         self._power_on()
 
-    def _start(self) -> None:
+    def _start(self, now_s: float) -> None:
         if self.running:
             raise Refusal(r.ERR_SEQUENCE, "the card runs already")
+        self._write_setup(now_s)
         setup = self.setup
         n_samples, n_channels, loops = setup[r.SPC_MEMSIZE], len(setup.channels), setup[r.SPC_LOOPS]
         if setup.mode == r.SPC_REP_STD_SINGLE:
@@ -281,10 +301,17 @@ class Machine:
         if setup.mode == r.SPC_REP_FIFO_SINGLE:
             if self.running:
                 raise Refusal(r.ERR_RUNNING, "card is still running, access not possible")
-            self.memory = Memory(self.model.bus_bytes_per_s)  # the FIFO takes its place
+            self.memory = Memory()  # the FIFO takes its place
             rate_hz, room_bytes = setup[r.SPC_SAMPLERATE], setup.on_card(r.SPC_DATA_OUTBUFSIZE)
-            bus = self.model.bus_bytes_per_s
-            self.fifo = Fifo(buffer, setup.frame_bytes, rate_hz, room_bytes, bus, keeps=self._keeps_streams)
+            self.fifo = Fifo(
+                buffer,
+                setup.frame_bytes,
+                rate_hz,
+                room_bytes,
+                self._speed(buffer),
+                self._faults,
+                keeps=self._keeps_streams,
+            )
         elif buffer.n_bytes > (room := self._room_bytes):
             raise refuse(buffer.n_bytes, f"at most {room} bytes; set the size first")
         self.buffer = buffer
@@ -304,8 +331,16 @@ class Machine:
             return
         if isinstance(self.memory, SequenceMemory):
             self.memory.check_unused(self.run.used if isinstance(self.run, SequenceRun) else None)
-        self.memory.send(now_s, self.buffer.fetch(0, self.buffer.n_bytes).copy())
+        data = self.buffer.fetch(0, self.buffer.n_bytes).copy()
+        self.memory.send(now_s, data, self._speed(self.buffer))
         self.buffer = None  # it is used only once
+
+    def _speed(self, buffer: Buffer) -> float:
+        """Speed of a transfer, in bytes per second."""
+        offset = buffer.address - self.continuous
+        continuous = 0 <= offset < self.model.continuous_bytes
+        bus = self.model.bus_bytes_per_s
+        return self._faults.write_speed(buffer.notify_bytes, bus, continuous=continuous)
 
     @property
     def is_transferring(self) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from labseq_spcm_sim import registers as r
+from labseq_spcm_sim.faults import Faults, LateCounter
 from labseq_spcm_sim.output import ROUNDING
 from labseq_spcm_sim.setup import OUTPUT_FIFO_BYTES, Refusal, refuse
 
@@ -64,22 +65,18 @@ class Buffer:
 class Memory:
     """The on-board memory and the bus to it.
 
-    Args:
-        bus_bytes_per_s: Speed of the bus.
-
     Attributes:
         uploads: Arrival and content of uploads that have not arrived yet, in order.
     """
 
-    def __init__(self, bus_bytes_per_s: float) -> None:
-        self._bus_bytes_per_s = bus_bytes_per_s
+    def __init__(self) -> None:
         self._uploaded: list[Samples] = []  # the latest first; those behind it are longer
         self._idle_s = -math.inf
         self.uploads: deque[tuple[float, Samples]] = deque()
 
-    def send(self, now_s: float, data: Samples) -> None:
-        """Put data for the beginning of the memory on the bus."""
-        self._idle_s = max(now_s, self._idle_s) + data.nbytes / self._bus_bytes_per_s
+    def send(self, now_s: float, data: Samples, bytes_per_s: float) -> None:
+        """Put data for the beginning of the memory on the bus, at a speed."""
+        self._idle_s = max(now_s, self._idle_s) + data.nbytes / bytes_per_s
         self.uploads.append((self._idle_s, data))
 
     def drop(self) -> None:
@@ -211,6 +208,7 @@ class Fifo:
         sample_rate_hz: Sample rate.
         room_bytes: How much of the on-board memory is used.
         bus_bytes_per_s: Speed of the bus.
+        faults: What the card does otherwise.
         keeps: Whether what is played is kept for :meth:`played`.
 
     Attributes:
@@ -231,11 +229,13 @@ class Fifo:
         sample_rate_hz: float,
         room_bytes: float,
         bus_bytes_per_s: float,
+        faults: Faults = Faults(),  # noqa: B008 - frozen
         *,
         keeps: bool = True,
     ) -> None:
         self._buffer, self._frame, self._rate, self._keeps = buffer, frame_bytes, sample_rate_hz, keeps
-        self._room, self._bus = room_bytes, bus_bytes_per_s
+        self._room, self._bus = room_bytes - faults.fifo_short_bytes, bus_bytes_per_s
+        self._copies, self._reported = faults.copies_samples, LateCounter(faults.position_lag_s)
         self._pieces: list[tuple[int, Stretch]] = []
         self._latched = 0
         self._now_s = -math.inf
@@ -251,11 +251,14 @@ class Fifo:
 
     def hand_over(self, n_bytes: int) -> None:
         """The user has filled bytes, which the card may now fetch."""
-        if not 0 <= n_bytes <= self.user_bytes:
-            raise refuse(n_bytes, f"0 to {self.user_bytes} bytes")
+        room = self.user_bytes + max(0, self._buffer.n_bytes - self.handed)
+        if not 0 <= n_bytes <= room:
+            raise refuse(n_bytes, f"0 to {room} bytes")
         if n_bytes % self._frame:
             raise refuse(n_bytes, f"a multiple of {self._frame} bytes")
         self.handed += n_bytes
+        if self._copies:
+            self._latch()
 
     def switch_dma(self, on: bool, now_s: float) -> None:
         """Whether the bus fetches what was handed over."""
@@ -268,10 +271,13 @@ class Fifo:
 
     @property
     def user_bytes(self) -> int:
-        """Bytes that are free for the user, in whole notify sizes."""
-        fetched = math.floor(self.fetched + ROUNDING_BYTES)
+        """Bytes that are free for the user, in whole notify sizes, as far as the card has reported it.
+
+        A new buffer counts as full (manual, "Buffer handling"): none are free until some were fetched.
+        """
+        fetched = math.floor(self._reported.at(self._now_s) + ROUNDING_BYTES)
         notified = fetched - fetched % max(1, self._buffer.notify_bytes)
-        return self._buffer.n_bytes - (self.handed - notified)
+        return notified - max(0, self.handed - self._buffer.n_bytes)
 
     @property
     def levels(self) -> tuple[float, float]:
@@ -281,12 +287,14 @@ class Fifo:
     @property
     def block_ready(self) -> bool:
         """Whether there is room for a block, or all was transferred."""
-        return self.user_bytes >= max(1, self._buffer.notify_bytes) or self.fetched >= self.handed
+        is_done = 0 < self.handed <= self.fetched
+        return self.user_bytes >= max(1, self._buffer.notify_bytes) or is_done
 
     def advance(self, now_s: float) -> None:
         """Let bytes flow up to now."""
         if self._now_s == -math.inf:
             self._now_s = now_s
+            self._reported.add(now_s, 0.0)
         while self._now_s < now_s and not self.failed and not self.finished:
             self._flow(now_s)
         self._now_s = max(self._now_s, now_s)
@@ -315,6 +323,7 @@ class Fifo:
                 end_s = max(self._now_s + step_s, math.nextafter(self._now_s, math.inf))
         self._now_s = end_s
         self.fetched = min(float(self.handed), self.fetched + speed * step_s)
+        self._reported.add(self._now_s, self.fetched)
         self.n_played = min(self.fetched, self.n_played + drain * step_s)
         self.finished = self.n_played >= self.total - ROUNDING_BYTES
 
@@ -322,6 +331,7 @@ class Fifo:
         """Keep the blocks that the bus has begun to fetch: what the user writes there now comes too late."""
         block = self._buffer.notify_bytes or self._frame
         begun = min(math.ceil((self.fetched - ROUNDING_BYTES) / block) * block, self.handed)
+        begun = self.handed if self._copies else begun
         start, self._latched = self._latched, max(self._latched, begun)
         if self._keeps and begun > start and not is_silent(self._buffer.fetch(start, begun - start)):
             step = self._buffer.notify_bytes or begun - start

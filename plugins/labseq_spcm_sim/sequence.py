@@ -83,7 +83,7 @@ class SequenceMemory(Memory):
     """
 
     def __init__(self, model: CardModel, n_channels: int) -> None:
-        super().__init__(model.bus_bytes_per_s)
+        super().__init__()
         self._room = model.memory_samples // n_channels
         self._n_channels = n_channels
         self._n_segments = 2
@@ -180,9 +180,9 @@ class SequenceMemory(Memory):
         if used is not None and self._selected in used:
             raise Refusal(r.ERR_SEQUENCE, f"segment {self._selected} is in use by the running sequence")
 
-    def send(self, now_s: float, data: Samples) -> None:
-        """Put data for the selected segment on the bus."""
-        super().send(now_s, data)
+    def send(self, now_s: float, data: Samples, bytes_per_s: float) -> None:
+        """Put data for the selected segment on the bus, at a speed."""
+        super().send(now_s, data, bytes_per_s)
         self._arriving.append(self._selected)
 
     def drop(self) -> None:

@@ -91,7 +91,7 @@ class LibraryOfProcess(SimulatedLibrary):
         if isinstance(card, ProcessCard):
             card.disconnect()
 
-    def emergency(self, script: Path) -> Emergency | None:
+    def emergency(self, script: Path, n_outputs: int) -> Emergency | None:
         """The driver's script, unchanged, on a library whose functions ask the process."""
         own = {"script": str(script), "library": "of the simulator", "card": self._path}
         return Emergency(Path(__file__).with_name("card_process_emergency.py"), own)
@@ -281,7 +281,7 @@ class _Opened:
     def forget(self, before_s: float) -> None:
         self._card.forget(before_s)
 
-    def state(self) -> tuple[bool, tuple[bool, bool]]:
+    def state(self) -> tuple[bool, tuple[bool, ...]]:
         """Whether it runs, and whether its output relays are closed."""
         return self._card.running, self._card.outputs_on
 

@@ -112,7 +112,8 @@ def _script(script: str) -> Any:
     def load(_library: str) -> Any:
         return library
 
-    globals_of.off.__globals__["load"] = load
+    for function in (value for name, value in vars(globals_of).items() if name in ("off", "play")):
+        function.__globals__["load"] = load
     return globals_of
 
 
@@ -124,3 +125,8 @@ def prepare(script: str, **arguments: Any) -> None:
 def off(script: str, **arguments: Any) -> str:
     """See the driver's script."""
     return _script(script).off(**arguments)
+
+
+def play(script: str, **arguments: Any) -> None:
+    """See the driver's script of the first contact."""
+    _script(script).play(**arguments)

@@ -109,14 +109,15 @@ def open_driver(
     motion: MotionSpec | None = None,
     model: CardModel = M4I6631,
     clock: FakeClock | None = None,
+    named: str = "",
     **settings: Any,
 ) -> Generator[Lab]:
-    """Within the block the driver is open on a simulated card."""
+    """Within the block the driver is open on a simulated card; ``named`` is its model in the settings."""
     clock = clock or FakeClock()
     card = SimulatedCard(clock, model=model)
     motion = motion or MotionSpec()
     with installed(card) as name:
-        given = {"card": name, "mode": mode, "sample_rate": RATE_HZ, **settings}
+        given = {"card": name, "mode": mode, "sample_rate": RATE_HZ, "model": named, **settings}
         chosen = SpcmSettings.model_validate(given)
         context = Context("mobile_tweezers", clock=clock, motion=motion)
         tweezers = SpcmMobileTweezers(chosen, context)

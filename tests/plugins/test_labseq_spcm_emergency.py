@@ -7,7 +7,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,7 @@ from labseq_soapy_sim import Ring
 from labseq_spcm import emergency as script
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm_sim import M4I6631, SampleSpan, SimulatedCard, installed, registers as r
+from labseq_spcm_sim import M4I6622, M4I6631, SampleSpan, SimulatedCard, installed, registers as r
 from labseq_spcm_sim.library import _library
 from labseq_spcm_sim.setup import Refusal
 
@@ -175,7 +176,7 @@ def test_the_script_stops_the_card_first_and_writes_the_set_up_to_open_the_relay
 
 def test_its_numbers_are_those_of_the_vendor() -> None:
     names = [name for name in vars(script) if name.startswith(("SPC", "M2"))]
-    assert len(names) == 11
+    assert len(names) == 9
     assert {name: getattr(script, name) for name in names} == {name: getattr(r, name) for name in names}
 
 
@@ -240,6 +241,19 @@ class Stubborn(SimulatedCard):
         return super().write_all([(register, value)])
 
 
+@contextmanager
+def found(card: SimulatedCard, monkeypatch: pytest.MonkeyPatch) -> Generator[None]:
+    """Within the block the script finds a card in this process as ``CARD``."""
+    with installed(card, CARD):
+        functions = {
+            name: ctypes.CFUNCTYPE(ctypes.c_int)(ctypes.cast(function, ctypes.c_void_p).value or 0)
+            for name, function in _library().functions.items()
+        }
+        library = script.signed(SimpleNamespace(**functions))
+        monkeypatch.setattr(script, "load", lambda _library: library)
+        yield
+
+
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stubborn]:
     """A card in this process, which the script finds as ``simulated``; it plays, with its outputs on."""
@@ -250,13 +264,7 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stubborn]:
         (r.SPC_M2CMD, r.M2CMD_CARD_START),
     ):
         assert card.write(register, value) == 0
-    with installed(card, CARD):
-        functions = {
-            name: ctypes.CFUNCTYPE(ctypes.c_int)(ctypes.cast(function, ctypes.c_void_p).value or 0)
-            for name, function in _library().functions.items()
-        }
-        library = script.signed(SimpleNamespace(**functions))
-        monkeypatch.setattr(script, "load", lambda _library: library)
+    with found(card, monkeypatch):
         yield card
 
 
@@ -368,3 +376,13 @@ def log_of(folder: Path) -> dict[str, str]:
     files = folder.glob("runs/*/*/watchdog.jsonl")
     rows = [json.loads(line) for file in files for line in file.read_text("utf-8").splitlines()]
     return {row["device"]: row["text"] for row in rows}
+
+
+def test_all_outputs_of_a_card_with_four_are_disabled(monkeypatch: pytest.MonkeyPatch) -> None:
+    card = SimulatedCard(FakeClock(), model=M4I6622)
+    outputs = [r.SPC_ENABLEOUT0 + 100 * n for n in range(4)]
+    for register, value in [*((register, 1) for register in outputs), (r.SPC_M2CMD, r.M2CMD_CARD_WRITESETUP)]:
+        assert card.write(register, value) == 0
+    with found(card, monkeypatch):
+        assert script.off("", CARD, 4) == "card stopped, outputs 0, 1, 2 and 3 disabled"
+    assert card.outputs_on == (False,) * 4

@@ -1,0 +1,200 @@
+"""`labseq first-contact`: the questions, the readings, the table of steps and the page."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from labseq.assembly.options import DryRun
+from labseq.console.output import report_compiling, say, write_text
+from labseq.errors import ConfigError, DeviceError, one_of
+from labseq.guard import StopFlag
+from labseq.kernels.kernel import announcing
+from labseq.roles.first_contact import ContactStep, Reading
+from labseq.safety.first_contact import Contact, Wanted, meet_devices
+from labseq.units import EXAMPLES, format_quantity, parse_quantity
+
+INSTRUMENTS: Final = {
+    "scope": "an oscilloscope with 50 Ohm inputs at both outputs, and no amplifier",
+    "reference": "a 10 MHz reference at the clock input",
+}
+
+
+def meet(
+    profile: str,
+    wanted: Wanted,
+    overrides: Sequence[str],
+    dry_run: DryRun,
+    *,
+    instruments: Sequence[str],
+    yes: bool,
+) -> int:
+    """Take the steps of a first contact, write its files, and print what they say.
+
+    Returns:
+        The exit code: 0, or 3 if a step failed.
+
+    Raises:
+        ConfigError: The profile or an option has an error, or there is nobody to ask.
+        DeviceError: A device cannot be opened, or is not safe.
+    """
+    for name in instruments:
+        if name not in INSTRUMENTS:
+            raise ConfigError(
+                f"--with: there is no instrument '{name}'; expected {one_of(list(INSTRUMENTS))}"
+            )
+    dialogue = _Terminal(instruments, asks=not yes)
+    with announcing(report_compiling):
+        contacts = meet_devices(profile, wanted, overrides, dry_run, dialogue, _warn)
+    for contact in contacts:
+        page = contact.path.with_suffix(".md")
+        write_text(page, page_text(contact))
+        say("", *_summary(contact, page))
+    return DeviceError.exit_code if any(contact.failed for contact in contacts) else 0
+
+
+def _warn(text: str) -> None:
+    say(f"warning: {text}", stream=sys.stderr)
+
+
+class _Terminal:
+    """Implements ``Dialogue`` with questions at the terminal.
+
+    Args:
+        instruments: Those that are connected; with ``asks``, the user is asked for the others.
+        asks: Whether to ask before each step.
+    """
+
+    def __init__(self, instruments: Sequence[str], *, asks: bool) -> None:
+        self._connected = dict.fromkeys(instruments, True)
+        self._asks = asks
+
+    def may_take(self, device: str, step: ContactStep, stop: StopFlag) -> bool:
+        """Ask for the instrument once, and before each step."""
+        if step.needs and not self._has(step.needs, stop):
+            say(f"{device}  {step.name:<16} left out: it needs {INSTRUMENTS[step.needs]}")
+            return False
+        say(f"{device}  {step.name}: {step.does}")
+        if step.prepare:
+            say(f"  connect and set: {step.prepare}")
+        return not self._asks or _answer("  take this step? [Y/n] ", stop).lower() not in ("n", "no")
+
+    def _has(self, instrument: str, stop: StopFlag) -> bool:
+        if instrument not in self._connected:
+            question = f"is there {INSTRUMENTS[instrument]}? [y/N] "
+            self._connected[instrument] = self._asks and _answer(question, stop).lower() in ("y", "yes")
+        return self._connected[instrument]
+
+    def reads(self, reading: Reading, stop: StopFlag) -> float | None:
+        """Ask for a reading until it makes sense."""
+        example = EXAMPLES[reading.dimension] if reading.dimension != "fraction" else "12"
+        while text := _answer(f"  read {reading.about} (such as {example}; empty: not read): ", stop):
+            try:
+                value = parse_quantity(text, reading.dimension)
+            except ValueError as error:
+                say(f"  {error}")
+                continue
+            if reading.low <= value <= reading.high:
+                return value
+            low, high = (_quantity(limit, reading.dimension) for limit in (reading.low, reading.high))
+            say(f"  {text} makes no sense here; expected {low} to {high}")
+        return None
+
+    def ended(self, result: Mapping[str, Any]) -> None:
+        """Say how it ended."""
+        if "failed" in result:
+            say(f"  FAILED: {result['failed']}")
+        elif "skipped" in result:
+            say(f"  nothing to measure: {result['skipped']}")
+        else:
+            say("  done; the outputs are off")
+
+
+def _quantity(value: float, dimension: str) -> str:
+    return f"{value:g}" if dimension == "fraction" else format_quantity(value, dimension)
+
+
+def _answer(question: str, stop: StopFlag) -> str:
+    """What the user types. A request to stop ends the wait, which ``input`` alone would not obey.
+
+    Raises:
+        ConfigError: Nobody can answer, because stdin is closed.
+        StopRequested: Ctrl-C.
+    """
+    sys.stdout.write(question)
+    sys.stdout.flush()
+    lines = list[str]()
+    reader = threading.Thread(target=lambda: lines.append(sys.stdin.readline()), daemon=True)
+    reader.start()
+    while reader.is_alive():
+        stop.wait(0.05)
+    if not lines or not lines[0]:
+        raise ConfigError("there is no terminal that could answer; give --yes, and --with for instruments")
+    return lines[0].strip()
+
+
+def _summary(contact: Contact, page: Path) -> list[str]:
+    content = contact.content
+    card = content["card"]
+    lines = [f"{contact.device}: {card['model']}, serial number {card['serial']}"]
+    verdict = content["verdict"]
+    if "stream" in verdict:
+        lines.append(f"mode stream: {'may be used' if verdict['stream'] else 'must not be used'}")
+    lines += [f"verdict: {verdict['reason']}", f"file: {contact.path}", f"page: {page}"]
+    return lines
+
+
+# The page
+
+
+def page_text(contact: Contact) -> str:
+    """The file as a page to read, in Markdown."""
+    content = contact.content
+    card, computer = content["card"], content["computer"]
+    simulated = " (simulated)" if card["simulated"] else ""
+    facts = [
+        ("serial number", card["serial"]),
+        ("driver", card["driver"]),
+        ("firmware", card["firmware"]),
+        ("computer", computer["node"]),
+        ("labseq", content["labseq"]),
+        ("time", content["ended_utc"]),
+    ]
+    lines = [f"# First contact: {card['model']}{simulated}", "", *_table(facts), "", "## Verdict", ""]
+    lines += [f"- {part}" for part in content["verdict"]["reason"].split("; ")]
+    if "stream" in content["verdict"]:
+        lines += ["", f"Mode `stream`: {'yes' if content['verdict']['stream'] else 'no'}."]
+    for step, result in content["measured"].items():
+        lines += ["", f"## {step}", "", *_table(_rows(result))]
+    lines += [
+        "",
+        f"Numbers are in SI units. The file beside this page, `{contact.path.name}`, is what labseq",
+    ]
+    return "\n".join([*lines, "reads; it has a digest, and must not be edited.", ""])
+
+
+def _table(rows: Sequence[tuple[str, Any]]) -> list[str]:
+    return ["| | |", "|---|---|", *(f"| {key} | {_cell(value)} |" for key, value in rows)]
+
+
+def _rows(result: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    rows: list[tuple[str, Any]] = []
+    for key, value in result.items():
+        if isinstance(value, Mapping):
+            rows += _rows(value, f"{prefix}{key}.")
+        else:
+            rows.append((f"{prefix}{key}", value))
+    return rows
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return "; ".join(
+            " ".join(map(_cell, item)) if isinstance(item, list) else _cell(item) for item in value
+        )
+    return "not told" if value is None else str(value).replace("|", "\\|")

@@ -1,0 +1,28 @@
+"""Steps in which a driver proves what it assumes about its device, and the file of what they measured."""
+
+from __future__ import annotations
+
+from labseq.drivers.first_contact import (
+    check_belongs,
+    contact_path,
+    digest_of,
+    read_contact,
+    this_computer,
+    write_contact,
+)
+from labseq.files import data_root
+from labseq.roles.first_contact import ContactStep, FirstContact, OffersFirstContact, Reading
+
+__all__ = [
+    "ContactStep",
+    "FirstContact",
+    "OffersFirstContact",
+    "Reading",
+    "check_belongs",
+    "contact_path",
+    "data_root",
+    "digest_of",
+    "read_contact",
+    "this_computer",
+    "write_contact",
+]

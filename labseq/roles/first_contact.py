@@ -1,0 +1,110 @@
+"""What a driver offers to `labseq first-contact`: steps that measure what it assumes about its device."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
+
+from labseq.roles.hardware import Emergency
+
+Instrument: TypeAlias = Literal["", "scope", "reference"]
+"""What a step needs beside the device: nothing, an oscilloscope at its outputs, a 10 MHz reference."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A number that the user reads from an instrument after a step.
+
+    Attributes:
+        name: Its key in the result.
+        about: What to read, for the question.
+        dimension: A key of :data:`labseq.units.UNITS`; "fraction" for a plain number.
+        low: Smallest value that makes sense, in SI.
+        high: Largest one.
+    """
+
+    name: str
+    about: str
+    dimension: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class ContactStep:
+    """One step of a first contact. It may be run alone, and leaves the device in its safe state.
+
+    Attributes:
+        name: Its key in the result, and the value of ``--step``.
+        does: What it does to the device and its outputs, for the question before it.
+        limit_s: Time after which it is abandoned and the device made safe, in seconds.
+        run: Does it; returns JSON values in SI. The key "skipped" says why there is nothing to measure.
+        needs: What must be connected.
+        prepare: What the user connects and sets first; "" for nothing.
+        readings: What the user reads afterwards, with the outputs off.
+    """
+
+    name: str
+    does: str
+    limit_s: float
+    run: Callable[[], Mapping[str, Any]]
+    needs: Instrument = ""
+    prepare: str = ""
+    readings: tuple[Reading, ...] = ()
+
+
+class FirstContact(ABC):
+    """The first contact with one device. It opens the device itself, not through the driver's ``open()``.
+
+    Attributes:
+        is_simulated: Whether the device exists only in software.
+        steps: The steps in their order.
+    """
+
+    is_simulated: bool = False
+    steps: Sequence[ContactStep] = ()
+
+    @abstractmethod
+    def open(self) -> Mapping[str, Any]:
+        """Open the device with its outputs off.
+
+        Returns:
+            "serial", "model", "driver" and "firmware" as text; "" for what the device does not tell.
+
+        Raises:
+            DeviceError: There is no such device, it is another model, or another program uses it.
+        """
+
+    @abstractmethod
+    def safe_state(self) -> None:
+        """Switch the outputs off; idempotent and legal in any state."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the device; legal in any state."""
+
+    def emergency(self) -> Emergency | None:
+        """As ``Hardware.emergency``."""
+        return None
+
+    @abstractmethod
+    def judge(self, measured: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Any]:
+        """Compare what was measured with what the driver assumes.
+
+        Args:
+            measured: Step -> its result; without the steps that were not taken.
+
+        Returns:
+            "reason", which names everything that differs; beside it what follows, such as "stream".
+        """
+
+
+@runtime_checkable
+class OffersFirstContact(Protocol):
+    """A driver that proves what it assumes. The method is called on a driver that is closed."""
+
+    def first_contact(self) -> FirstContact:
+        """The steps, which use the device instead of the driver."""
+        ...
