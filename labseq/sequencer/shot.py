@@ -191,7 +191,7 @@ T = TypeVar("T")
 EARLY = 0.05
 """Part of its exposure by which a frame may come early: cameras round exposure times."""
 PLAYED_EARLY_S = 10e-6
-"""By how much a program may end early: its playing time includes delays of the device."""
+"""By how much a program may end early, beside the delay of the device, which may be shorter than it says."""
 
 
 class RunningShot:
@@ -420,7 +420,7 @@ class RunningShot:
     def _check_end(self, least_s: float) -> None:
         """Refuse a program that ended before it can be over: it was started by a trigger too many."""
         early_s = self._fired_s + least_s - self.clock.now()
-        if early_s > PLAYED_EARLY_S:
+        if early_s > PLAYED_EARLY_S + self.mobile_tweezers.start_delay_s:
             text = f"a program ended {format_quantity(early_s, 'time')} too early, so a pulse before that of"
             text += " the line started it; look for a second edge at the trigger input"
             raise DeviceError("mobile_tweezers", text)

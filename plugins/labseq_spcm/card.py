@@ -270,16 +270,33 @@ class AwgCard:
         Raises:
             DeviceTimeoutError: They take too long.
         """
+        start_s = self.begin_upload(frames)
+        self.finish_upload(frames.nbytes, poll_s)
+        return self.clock.now() - start_s
+
+    def begin_upload(self, frames: NDArray[np.int16]) -> float:
+        """Begin to transfer samples to the on-board memory; the array must live until they have arrived.
+
+        Returns:
+            When it began, without the naming of the buffer.
+        """
         self.define_transfer(frames)
         start_s = self.clock.now()
         self.command(self.spcm.M2CMD_DATA_STARTDMA, "upload")
-        limit_s = frames.nbytes / self._slowest_bytes_per_s + TRANSFER_TIMEOUT_S
-        deadline_s = start_s + limit_s
+        return start_s
+
+    def finish_upload(self, n_bytes: int, poll_s: float) -> None:
+        """Wait until all has arrived.
+
+        Raises:
+            DeviceTimeoutError: It takes too long.
+        """
+        limit_s = n_bytes / self._slowest_bytes_per_s + TRANSFER_TIMEOUT_S
+        deadline_s = self.clock.now() + limit_s
         while not self.status & self.spcm.M2STAT_DATA_END:
             if self.clock.now() > deadline_s:
-                raise DeviceTimeoutError(self.name, f"{frames.nbytes} bytes were not uploaded", limit_s)
+                raise DeviceTimeoutError(self.name, f"{n_bytes} bytes were not uploaded", limit_s)
             self.clock.sleep(poll_s)
-        return self.clock.now() - start_s
 
     def stop(self) -> None:
         """Stop playing and transferring; no effect if it does neither."""

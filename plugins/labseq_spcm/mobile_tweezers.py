@@ -37,6 +37,7 @@ from labseq_spcm.certificate import check_certificate, permitted
 from labseq_spcm.keep_warm import keep_warm_tones
 from labseq_spcm.library import choose_library, load_spcm
 from labseq_spcm.play_mode import PlayMode
+from labseq_spcm.play_sequence import SequenceReplay
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.set_up import (
     check_type,
@@ -141,7 +142,7 @@ class SpcmMobileTweezers(MobileTweezers):
         return math.inf if self._mode is None else self._mode.beginning_s
 
     def warnings(self) -> list[str]:
-        """A stream without a certificate, rates that do not suit the reference clock or render slowly."""
+        """A stream without a certificate; rates that do not suit the reference clock, or render slowly."""
         settings, grid = self._settings, self._context.grid
         found = limits.reference_warnings(self._name, settings.sample_rate, settings.reference_clock, grid)
         if self._uncertified:
@@ -151,8 +152,6 @@ class SpcmMobileTweezers(MobileTweezers):
         return found + self._rendering_warnings()
 
     def _rendering_warnings(self) -> list[str]:
-        if self._settings.mode != "stream":
-            return []
         rate_hz = self._settings.sample_rate
         try:
             best_hz = comb_sample_rate(self._context.grid, rate_hz)
@@ -161,9 +160,9 @@ class SpcmMobileTweezers(MobileTweezers):
         if best_hz == rate_hz:
             return []
         rate, best = (format_quantity(hz, "frequency") for hz in (rate_hz, best_hz))
-        what = f"profile.{self._name}.sample_rate is {rate}; its samples take three times as long to render"
-        why = f"as those at {best}, a whole number per tone spacing: too long for most computers"
-        return [f"{what} {why}; set sample_rate: {best}, or use another mode than stream"]
+        what = f"profile.{self._name}.sample_rate is {rate}; its samples take up to three times as long"
+        why = f"to render as those at {best}, a whole number per tone spacing"
+        return [f"{what} {why}; set sample_rate: {best}"]
 
     def warm(self) -> None:
         """Import the vendor's package, and compile the kernels of the mode or load them from the cache.
@@ -217,6 +216,10 @@ class SpcmMobileTweezers(MobileTweezers):
             stream = Stream(card, self._settings, rate_hz, self._keep_warm)
             self._facts |= {"trigger_delay_s": stream.delay_s, "bus_bytes_per_s": stream.bus_bytes_per_s}
             return stream
+        if self._settings.mode == "sequence":
+            sequence = SequenceReplay(card, self._settings, rate_hz, self._keep_warm)
+            self._facts["trigger_delay_s"] = sequence.delay_s
+            return sequence
         mode = Replay if self._settings.mode == "replay" else Fifo
         return mode(card, self._settings, rate_hz)
 
@@ -298,7 +301,10 @@ class SpcmMobileTweezers(MobileTweezers):
                 self._name, "append() while nothing plays; call prepare_beginning() and play() first"
             )
         self.check_program(program)
-        self._due_s += max(mode.append(program), program.total_duration_s)
+        added_s = max(mode.append(program), program.total_duration_s)
+        if not self._is_settled:  # by another thread
+            raise DeviceError(self._name, "stopped by safe_state() while it played")
+        self._due_s += added_s
 
     def wait(self, timeout_s: float) -> None:
         """Wait until the program has been played to its end; returns at once if none is playing.
@@ -309,7 +315,7 @@ class SpcmMobileTweezers(MobileTweezers):
             TransientError: The card ran out of data: what it played is not the program.
             DeviceError: Not open, or the card refuses.
         """
-        card, mode = self._opened()
+        mode = self._opened()[1]
         due_s = self._due_s
         if due_s is None:
             return
@@ -318,7 +324,7 @@ class SpcmMobileTweezers(MobileTweezers):
             while not mode.finished():
                 now_s = self._clock.now()
                 if now_s >= deadline_s:
-                    raise self._timeout(card, timeout_s)
+                    raise self._timeout(mode, timeout_s)
                 idle_s = max(POLL_S, due_s - now_s) if math.isfinite(due_s) else POLL_S
                 self._clock.sleep(min(deadline_s - now_s, mode.max_wait_s, idle_s))
                 if self._due_s is None:
@@ -331,9 +337,9 @@ class SpcmMobileTweezers(MobileTweezers):
             raise DeviceError(self._name, "stopped by safe_state() while it played")
         self._due_s = None
 
-    def _timeout(self, card: AwgCard, timeout_s: float) -> DeviceTimeoutError:
+    def _timeout(self, mode: PlayMode, timeout_s: float) -> DeviceTimeoutError:
         waited = format_quantity(timeout_s, "time")
-        if card.triggered:
+        if mode.triggered:
             text = f"still playing after {waited}"
         else:
             text = f"no trigger came within {waited}; check the cable at Ext0 and trigger_level"
@@ -405,7 +411,7 @@ class SpcmMobileTweezers(MobileTweezers):
     def self_test(self) -> None:
         """Check the card's firmware, temperatures, clock and memory, outputs off; drops the prepared program.
 
-        Samples are sent in the mode ``replay`` only: the others do not use the memory as a whole.
+        Samples are sent in the modes ``replay`` and ``sequence``: the others use the memory as a FIFO.
 
         Raises:
             DeviceError: Not open, still playing, or a check failed.
@@ -430,11 +436,9 @@ class SpcmMobileTweezers(MobileTweezers):
         if rates_hz[0] != rates_hz[1]:
             actual, expected = (format_quantity(hz, "frequency") for hz in rates_hz)
             raise DeviceError(self._name, f"the sample rate is {actual}; expected {expected}, as it was set")
-        if self._settings.mode == "replay":
-            frames = Buffer().reserve(TEST_SAMPLES)
-            frames[:] = 0
-            card.set(spcm.SPC_MEMSIZE, TEST_SAMPLES, "memory size")
-            card.upload(frames)
+        frames = Buffer().reserve(TEST_SAMPLES)
+        frames[:] = 0
+        mode.check_memory(frames)
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
         """Versions of the package, the drivers and the card's firmware."""
@@ -445,6 +449,7 @@ class SpcmMobileTweezers(MobileTweezers):
         facts = dict(self._facts)
         if isinstance(self._mode, Stream):
             facts["silent_underruns"] = self._mode.n_underruns
+        if isinstance(self._mode, Stream | SequenceReplay):
             facts["delayed_batches"] = self._mode.n_pauses
         settings = self._settings.model_dump(mode="json")
         if self._uncertified:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 
+import numpy as np
+from numpy.typing import NDArray
+
 from labseq.plugin import DeviceError, ToneProgram
 from labseq_spcm.card import AwgCard
 
@@ -58,6 +61,14 @@ class PlayMode(ABC):
             LimitError: It cannot play this one.
         """
         raise DeviceError(self._card.name, "this mode plays whole programs only")
+
+    @property
+    def triggered(self) -> bool:
+        """Whether a program has begun since ``start``."""
+        return self._card.triggered
+
+    def check_memory(self, frames: NDArray[np.int16]) -> None:
+        """Send samples to the on-board memory while nothing plays, if the mode uploads programs."""
 
     def idle(self) -> None:
         """Start what plays between programs, if anything does."""

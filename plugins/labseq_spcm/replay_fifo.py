@@ -35,10 +35,12 @@ class InterleavedRenderer:
 
     Attributes:
         n_samples: Samples per channel, with silence up to the card's granularity.
+        first_sample: First sample of each segment of the program, and its end.
     """
 
     def __init__(self, program: ToneProgram, sample_rate_hz: float, row_channel: int) -> None:
         self._renderer = Renderer(program, sample_rate_hz)
+        self.first_sample = self._renderer.first_sample
         self._channels = (row_channel, 1 - row_channel)
         self._chunk = np.empty((2, CHUNK), np.int16)
         self.n_samples = max(1, math.ceil(self._renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP
@@ -91,6 +93,11 @@ class Replay(PlayMode):
         self._card.set(self._card.spcm.SPC_MEMSIZE, n_samples, "memory size")
         self._card.upload(frames)
         return n_samples / self._rate_hz
+
+    def check_memory(self, frames: NDArray[np.int16]) -> None:
+        """Send samples to the memory."""
+        self._card.set(self._card.spcm.SPC_MEMSIZE, len(frames), "memory size")
+        self._card.upload(frames)
 
     def finished(self) -> bool:
         """Whether the program has been played to its end."""

@@ -10,12 +10,10 @@ from labseq.plugin import Duration, FilePath, Frequency, Settings, Voltage, form
 from labseq_spcm import limits
 from labseq_spcm.models import ANY, MODELS, Model
 
-Mode: TypeAlias = Literal["replay", "fifo", "stream"]
+Mode: TypeAlias = Literal["sequence", "replay", "fifo", "stream"]
 Channel: TypeAlias = Literal[0, 1, 2, 3]
 
-NO_TRIGGER: Final = (
-    "takes no external trigger, because the card runs all the time; leave the trigger out, or use mode: fifo"
-)
+NO_TRIGGER: Final = "takes no external trigger: a stream waits for nothing; use mode: sequence for it"
 
 
 class KeepWarmSettings(Settings):
@@ -70,8 +68,9 @@ class SpcmSettings(Settings):
     )
     serial: int = Field(default=0, ge=0, description="serial number that the card must have; 0: any")
     mode: Mode = Field(
-        default="replay",
-        description="replay: uploaded whole, then played; fifo: streamed while it is being rendered; "
+        default="sequence",
+        description="sequence: uploaded in parts beside a loop that plays, which then leads to them; "
+        "replay: uploaded whole, then played; fifo: streamed while it is being rendered; "
         "stream: the same, spliced into silence that the card plays all the time",
     )
     sample_rate: Frequency = Field(
@@ -126,7 +125,7 @@ class SpcmSettings(Settings):
         default=CardFaults(), description="what the simulated card does otherwise than a real one should"
     )
     keep_warm: KeepWarmSettings | None = Field(
-        default=None, description="stream: tones off the atoms between programs; none: silence"
+        default=None, description="sequence and stream: tones off the atoms between programs; none: silence"
     )
 
     @field_validator("model")
@@ -199,7 +198,7 @@ class SpcmSettings(Settings):
             rate, most = _hz(self.sample_rate), _hz(self.limits.fifo_rate_hz)
             raise ValueError(
                 f"sample_rate is {rate}, but the bus carries at most {most} on two channels; lower it, or "
-                "use mode: replay"
+                "use mode: sequence"
             )
         return self
 
@@ -212,12 +211,12 @@ class SpcmSettings(Settings):
 
     @model_validator(mode="after")
     def _check_stream(self) -> Self:
+        if self.keep_warm is not None and self.mode not in ("sequence", "stream"):
+            raise ValueError(
+                f"keep_warm is set, but mode: {self.mode} leaves the AODs dark while it uploads "
+                "programs; use mode: sequence, or leave keep_warm out"
+            )
         if self.mode != "stream":
-            if self.keep_warm is not None:
-                raise ValueError(
-                    f"keep_warm is set, but mode: {self.mode} leaves the AODs dark while it uploads "
-                    "programs; use mode: stream, or leave keep_warm out"
-                )
             return self
         if self.trigger == "external":
             raise ValueError(f"mode: stream {NO_TRIGGER}")
@@ -243,7 +242,7 @@ class SpcmSettings(Settings):
         """Time from a cycle's plan to its light in the mode that is used: measured, see the timing budget."""
         from labseq_spcm.certificate import permitted
 
-        return {"replay": 20e-3, "fifo": 17e-3, "stream": 3e-3}[permitted(self)[0].mode]
+        return {"replay": 20e-3, "sequence": 6e-3, "fifo": 17e-3, "stream": 3e-3}[permitted(self)[0].mode]
 
     @property
     def fill_s(self) -> float:

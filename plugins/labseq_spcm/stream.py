@@ -111,14 +111,23 @@ def stream_program(
     n_samples = max(1, math.ceil(renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP
     words[k.LENGTH], words[k.ROW_CHANNEL] = -(-n_samples // block) * block, row_channel
     words[k.AXES], words[k.N_AXIS] = axes.ctypes.data, axes.shape[1]
-    cuts = np.empty(len(renderer.first_sample), np.int64)
+    cuts = np.append(silent_joints(program, renderer.first_sample), words[k.LENGTH])
+    words[k.CUTS], words[k.N_CUTS] = cuts.ctypes.data, len(cuts)
+    return Program(words, axes, cuts, renderer, n_samples / sample_rate_hz)
+
+
+def silent_joints(program: ToneProgram, first_sample: NDArray[np.int64]) -> NDArray[np.int64]:
+    """First samples after the joints between segments at which no tone is on, int64 (n,).
+
+    Args:
+        program: The program.
+        first_sample: First sample of each segment, and the end, int64 (n_segments + 1,).
+    """
+    joints = np.empty(len(first_sample), np.int64)
     axis_tones = [
         (axis.offsets, axis.start_amplitude, axis.end_amplitude) for axis in (program.row, program.column)
     ]
-    n_cuts = k.find_cuts(renderer.first_sample, *axis_tones[0], *axis_tones[1], cuts)
-    cuts[n_cuts] = words[k.LENGTH]
-    words[k.CUTS], words[k.N_CUTS] = cuts.ctypes.data, n_cuts + 1
-    return Program(words, axes, cuts, renderer, n_samples / sample_rate_hz)
+    return joints[: k.find_cuts(first_sample, *axis_tones[0], *axis_tones[1], joints)]
 
 
 def new_scratch() -> NDArray[np.int16]:

@@ -10,6 +10,7 @@ from labseq_spcm_sim import registers as r
 from labseq_spcm_sim.faults import Faults
 from labseq_spcm_sim.modes import Buffer, Fifo, Memory, Replay, Run, Stretch
 from labseq_spcm_sim.output import Amplifier, SampleSpan
+from labseq_spcm_sim.sequence import REGISTERS, SequenceMemory, SequenceRun
 from labseq_spcm_sim.setup import (
     AMPLITUDES,
     OUTPUTS,
@@ -120,6 +121,8 @@ class Machine:
         self.samples = [record for record in self.samples if record.span(record.channels[0]).end_s > before_s]
         if self.fifo is not None:
             self.fifo.forget(before_s)
+        if isinstance(self.run, SequenceRun):
+            self.run.forget(before_s)
         for amplifier in self.amplifiers:
             amplifier.forget(before_s)
 
@@ -133,8 +136,12 @@ class Machine:
             if self.fifo is None:
                 raise Refusal(r.ERR_SEQUENCE, "no FIFO buffer is defined")
             self.fifo.hand_over(int(value))
+        elif register in REGISTERS:
+            self._write_sequence(register, int(value))
         else:
             self.setup.write(register, value, running=self.running)
+            if register == r.SPC_CARDMODE:
+                self._set_mode(int(value))
             if register in AMPLITUDES:
                 self.amplifiers[AMPLITUDES[register]].set_amplitude(self.setup[register], now_s)
 
@@ -146,9 +153,43 @@ class Machine:
             return len(self.setup.channels)
         if register == r.SPC_DATA_AVAIL_USER_LEN:
             return self.fifo.user_bytes if self.fifo else self.free_bytes
+        if register in REGISTERS and register not in self.setup:
+            if register == r.SPC_SEQMODE_STATUS:
+                return self.run.at_output if isinstance(self.run, SequenceRun) else 0
+            return self._sequence_memory.value(register)
         if register not in self.setup:
             raise Refusal(r.ERR_REG, UNKNOWN)
         return self.setup[register]
+
+    # Sequence mode
+
+    def _set_mode(self, mode: int) -> None:
+        """The memory is divided in the mode STD_SEQUENCE, and whole in the others."""
+        if (mode == r.SPC_REP_STD_SEQUENCE) != isinstance(self.memory, SequenceMemory):
+            is_divided = mode == r.SPC_REP_STD_SEQUENCE
+            n_channels = len(self.setup.channels)
+            self.memory = SequenceMemory(self.model, n_channels) if is_divided else Memory()
+
+    @property
+    def _sequence_memory(self) -> SequenceMemory:
+        if not isinstance(self.memory, SequenceMemory):
+            raise Refusal(r.ERR_SEQUENCE, "set the card mode SPC_REP_STD_SEQUENCE first")
+        return self.memory
+
+    def _write_sequence(self, register: int, value: int) -> None:
+        """Write a register of the sequence mode; steps in use must lead to samples that are there."""
+        memory, run = self._sequence_memory, self.run
+        if not isinstance(run, SequenceRun):
+            memory.write(register, value, None)
+            return
+        number = register - r.SPC_SEQMODE_STEPMEM0
+        step = memory.steps.get(number)
+        memory.write(register, value, run.used)
+        try:
+            _ = run.used
+        except Refusal:
+            memory.restore(number, step)
+            raise
 
     def _status(self) -> int:
         """The bits of SPC_M2STATUS."""
@@ -189,6 +230,8 @@ class Machine:
             self._fire(now_s)
         if command & r.M2CMD_CARD_DISABLETRIGGER:
             self.trigger_enabled = False
+            if isinstance(self.run, SequenceRun):
+                self.run.drop_trigger()
 
     def _write_setup(self, now_s: float) -> None:
         """The set-up is written to the card: its relays follow the registers."""
@@ -216,6 +259,10 @@ class Machine:
         if setup.mode == r.SPC_REP_STD_SINGLE:
             memory = self.memory
             self.run = Replay(lambda: memory.read(n_samples, n_channels), setup[r.SPC_SAMPLERATE], loops)
+        elif setup.mode == r.SPC_REP_STD_SEQUENCE:
+            keeps = self._keeps_streams
+            rate_hz = setup[r.SPC_SAMPLERATE]
+            self.run = SequenceRun(self._sequence_memory, n_channels, rate_hz, keeps=keeps)
         elif self.fifo is None:
             raise Refusal(r.ERR_SEQUENCE, "no FIFO buffer is defined")
         else:
@@ -265,9 +312,16 @@ class Machine:
                 self._faults,
                 keeps=self._keeps_streams,
             )
-        elif buffer.n_bytes > (room := setup[r.SPC_MEMSIZE] * setup.frame_bytes):
-            raise refuse(buffer.n_bytes, f"at most {room} bytes; set the memory size first")
+        elif buffer.n_bytes > (room := self._room_bytes):
+            raise refuse(buffer.n_bytes, f"at most {room} bytes; set the size first")
         self.buffer = buffer
+
+    @property
+    def _room_bytes(self) -> int:
+        """Bytes of the memory, or of the segment, that the next transfer fills."""
+        if isinstance(self.memory, SequenceMemory):
+            return self.memory.room_bytes
+        return self.setup[r.SPC_MEMSIZE] * self.setup.frame_bytes
 
     def _start_dma(self, now_s: float) -> None:
         if self.buffer is None:
@@ -275,6 +329,8 @@ class Machine:
         if self.fifo is not None:
             self.fifo.switch_dma(on=True, now_s=now_s)
             return
+        if isinstance(self.memory, SequenceMemory):
+            self.memory.check_unused(self.run.used if isinstance(self.run, SequenceRun) else None)
         data = self.buffer.fetch(0, self.buffer.n_bytes).copy()
         self.memory.send(now_s, data, self._speed(self.buffer))
         self.buffer = None  # it is used only once
@@ -293,6 +349,6 @@ class Machine:
 
     def stop_dma(self, now_s: float) -> None:
         """What has not arrived is lost."""
-        self.memory.uploads.clear()
+        self.memory.drop()
         if self.fifo is not None:
             self.fifo.switch_dma(on=False, now_s=now_s)

@@ -79,6 +79,10 @@ class Memory:
         self._idle_s = max(now_s, self._idle_s) + data.nbytes / bytes_per_s
         self.uploads.append((self._idle_s, data))
 
+    def drop(self) -> None:
+        """What has not arrived is lost."""
+        self.uploads.clear()
+
     def store(self, data: Samples) -> None:
         """Data arrive; a replay that has begun keeps the old content."""
         self._uploaded = [data, *(older for older in self._uploaded if len(older) > len(data))]

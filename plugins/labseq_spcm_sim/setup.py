@@ -49,7 +49,7 @@ class CardModel:
     name: str = "M4i.6631-x8"
     card_type: int = 0x76631
     n_channels: int = 2
-    modes: int = r.SPC_REP_STD_SINGLE | r.SPC_REP_FIFO_SINGLE
+    modes: int = r.SPC_REP_STD_SINGLE | r.SPC_REP_FIFO_SINGLE | r.SPC_REP_STD_SEQUENCE
     memory_samples: int = 2 * 1024**3
     sample_rate_hz: tuple[float, float] = (50e6, 1.25e9)
     rate_gaps_hz: tuple[tuple[float, float], ...] = ((750e6, 757e6), (1125e6, 1145e6))
@@ -92,6 +92,10 @@ PLL_LOCK_S: Final = 200e-3
 MEMORY_STEP: Final = 32
 """Step and minimum of the memory size, in samples per channel."""
 MAX_LOOPS: Final = 2**32 - 1
+MAX_SEGMENTS: Final = 1 << 16
+MAX_STEPS: Final = 4096
+MAX_LOOPS_OF_STEP: Final = (1 << 20) - 1
+"""Of the sequence mode."""
 
 
 def trigger_delay_s(sample_rate_hz: float) -> float:
@@ -298,7 +302,7 @@ _SWITCH: Final = one_of(0, 1)
 _STOP_LEVEL: Final = one_of(
     r.SPCM_STOPLVL_ZERO, r.SPCM_STOPLVL_LOW, r.SPCM_STOPLVL_HIGH, r.SPCM_STOPLVL_HOLDLAST
 )
-_MODES: Final = (r.SPC_REP_STD_SINGLE, r.SPC_REP_FIFO_SINGLE)
+_MODES: Final = (r.SPC_REP_STD_SINGLE, r.SPC_REP_FIFO_SINGLE, r.SPC_REP_STD_SEQUENCE)
 
 _SETTINGS: Final[dict[int, tuple[Rule, Number]]] = {
     r.SPC_TIMEOUT: (within(0, 2**31 - 1), 0),
@@ -350,7 +354,7 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_PCIEXPGENERATION: model.pcie[0],
         r.SPC_PCIEXPLANES: model.pcie[1],
         r.SPC_PCIMEMSIZE: 2 * model.memory_samples,
-        r.SPC_PCIFEATURES: 0,
+        r.SPC_PCIFEATURES: r.SPCM_FEAT_SEQUENCE,
         r.SPC_PCIEXTFEATURES: r.SPCM_FEAT_EXTFW_AWG,
         r.SPC_MIINST_MODULES: 1,
         r.SPC_MIINST_CHPERMODULE: model.n_channels,
@@ -371,4 +375,8 @@ def _fixed(model: CardModel) -> dict[int, Number]:
         r.SPC_AVAILMEMSIZE_MIN: MEMORY_STEP,
         r.SPC_AVAILMEMSIZE_MAX: model.memory_samples,
         r.SPC_AVAILMEMSIZE_STEP: MEMORY_STEP,
+        r.SPC_SEQMODE_AVAILMAXSEGMENT: MAX_SEGMENTS,
+        r.SPC_SEQMODE_AVAILMAXSTEPS: MAX_STEPS,
+        r.SPC_SEQMODE_AVAILMAXLOOP: MAX_LOOPS_OF_STEP,
+        r.SPC_SEQMODE_AVAILFEATURES: r.SPCSEQ_ENDLOOPONTRIG | r.SPCSEQ_END,
     }

@@ -70,7 +70,7 @@ def card(folder, repeat, mode):
     name = f"simulated@{folder}/{mode}{repeat}"
     chosen = SpcmSettings(card=name, mode=mode, sample_rate=50e6, trigger="software", fill=0.1)
     device = TweezersOfProcess(chosen, Context("mobile_tweezers", GRID, motion=MOTION))
-    program = tone_program(PLAN, GRID, MOTION, 1 if mode == "replay" else 50)
+    program = tone_program(PLAN, GRID, MOTION, 50 if mode in ("fifo", "stream") else 1)
     def play():
         device.play()
         if mode == "fifo":
@@ -107,7 +107,7 @@ def fill_memory():
     resource.setrlimit(resource.RLIMIT_AS, (64 << 20, 64 << 20))
     full = [bytearray(1 << 20) for _ in range(1 << 20)]
 
-for mode in {"replay", "fifo", "stream"} & set(sys.argv[2:]):  # here, not again in every child
+for mode in {"replay", "sequence", "fifo", "stream"} & set(sys.argv[2:]):  # here, not again in every child
     settings_here = SpcmSettings(card="simulated", mode=mode, sample_rate=50e6, fill=0.1)
     warmed = SpcmMobileTweezers(settings_here, Context("mobile_tweezers", GRID, motion=MOTION))
     warmed.warm()
@@ -130,7 +130,7 @@ CAUSES: Final = {
     "C call": "ctypes.PyDLL(None).sleep(60)",
 }
 """What ends or stops the process."""
-CARDS: Final = ("fifo", "stream", "replay")
+CARDS: Final = ("fifo", "stream", "sequence", "replay")
 """Simulated cards, by mode; replay comes last, because it plays for less than a second."""
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from labseq_spcm.keep_warm import KeepWarm
 from labseq_spcm.mobile_tweezers import HOT_C, TEST_SAMPLES, SpcmMobileTweezers
+from labseq_spcm.play_sequence import SILENT_SAMPLES
 from labseq_spcm.replay_fifo import CHUNK, InterleavedRenderer
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import M4I6631, SimulatedCard, SimulatedLibrary, installed, registers
@@ -36,14 +37,20 @@ from labseq.testing.fakes import FakeClock
 
 from .conftest import RATE_HZ
 
-MODES = ["replay", "fifo", "stream"]
-TRIGGERED = ["replay", "fifo"]
+MODES = ["replay", "sequence", "fifo", "stream"]
+TRIGGERED = ["replay", "sequence", "fifo"]
 
 
 class TestReplayContract(MobileTweezersContract):
     @pytest.fixture
     def factory(self) -> Callable[[Context], SpcmMobileTweezers]:
-        return partial(SpcmMobileTweezers, SpcmSettings(card="simulated"))
+        return partial(SpcmMobileTweezers, SpcmSettings(card="simulated", mode="replay"))
+
+
+class TestSequenceContract(MobileTweezersContract):
+    @pytest.fixture
+    def factory(self) -> Callable[[Context], SpcmMobileTweezers]:
+        return partial(SpcmMobileTweezers, SpcmSettings(card="simulated", mode="sequence"))
 
 
 class TestFifoContract(MobileTweezersContract):
@@ -59,7 +66,7 @@ class TestStreamContract(MobileTweezersContract):
 
 
 class TestSamples:
-    @pytest.mark.parametrize(("mode", "row_channel"), [("replay", 0), ("fifo", 1)])
+    @pytest.mark.parametrize(("mode", "row_channel"), [("replay", 0), ("sequence", 0), ("fifo", 1)])
     def test_are_what_was_rendered_and_then_silence(self, driver: Any, mode: str, row_channel: int) -> None:
         motion = MotionSpec(rf=RfSpec(full_scale_v=0.2))
         outputs = {"row_channel": row_channel}
@@ -84,7 +91,8 @@ class TestPlaying:
         with driver(mode) as lab:
             program = lab.program(3)
             delay_s = float(lab.tweezers.describe()["trigger_delay_s"])
-            assert 0.1e-6 < delay_s < (500e-6 if mode == "stream" else 10e-6)
+            most_s = {"stream": 500e-6, "sequence": 110e-6}.get(mode, 10e-6)
+            assert 0.1e-6 < delay_s < most_s
             assert lab.tweezers.prepare(program) == pytest.approx(
                 program.total_duration_s + delay_s, abs=1.5 / lab.rate_hz * 32
             )
@@ -115,7 +123,8 @@ class TestPlaying:
             lab.tweezers.wait(duration_s + 1e-3)
             begun_s = lab.card.played(0)[0].start_s
             delay_s = float(lab.tweezers.describe()["trigger_delay_s"])
-            assert begun_s - triggered_s == pytest.approx(delay_s, abs=1e-9)
+            loop_s = SILENT_SAMPLES / lab.rate_hz if mode == "sequence" else 1e-9
+            assert -1e-9 < triggered_s + delay_s - begun_s < loop_s
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -173,12 +182,13 @@ def _shot(lab: Any) -> tuple[float, float, float]:
 
 
 class TestKeepWarm:
-    def test_holds_the_mean_power_over_a_shot(self, driver: Any) -> None:
-        with driver("stream") as lab:
+    @pytest.mark.parametrize("mode", ["sequence", "stream"])
+    def test_holds_the_mean_power_over_a_shot(self, driver: Any, mode: str) -> None:
+        with driver(mode) as lab:
             start_s, end_s, busy = _shot(lab)
             assert busy < 0.2
             silent = [_power_w(lab, channel, start_s, end_s) for channel in (0, 1)]
-        with driver("stream", keep_warm=PARKED) as lab:
+        with driver(mode, keep_warm=PARKED) as lab:
             n_tones = lab.motion.max_row_tones, lab.motion.max_column_tones
             assert _power_w(lab, 0, lab.clock.now() - 1e-3, lab.clock.now()) == 0
             start_s, end_s, busy = _shot(lab)
@@ -214,13 +224,14 @@ class TestKeepWarm:
             SpcmMobileTweezers(settings, Context("mobile_tweezers", motion=motion))
         assert refused.value.setting == ("keep_warm", key)
 
+    @pytest.mark.parametrize("mode", ["sequence", "stream"])
     @pytest.mark.parametrize("row_hz", [82.2e6, 84.8e6])
-    def test_reaches_the_virtual_atoms_only_if_it_is_on_them(self, row_hz: float) -> None:
+    def test_reaches_the_virtual_atoms_only_if_it_is_on_them(self, row_hz: float, mode: str) -> None:
         tones = KeepWarm((row_hz, 84.8e6), (0.3, 0.3))
         clock, grid = FakeClock(), Context().grid
         card = SimulatedCard(clock)
         with installed(card) as name:
-            settings = SpcmSettings(card=name, mode="stream", sample_rate=RATE_HZ)
+            settings = SpcmSettings.model_validate({"card": name, "mode": mode, "sample_rate": RATE_HZ})
             tweezers = SpcmMobileTweezers(settings, Context("mobile_tweezers", clock=clock))
             tweezers._keep_warm = tones
             tweezers.open()
@@ -233,7 +244,7 @@ class TestKeepWarm:
             assert row.amplitude_v == pytest.approx([0.3 * 1.6], rel=1e-3)
             lit = [active_spans(spans[0], limits) for spans, limits in zip(source, reach, strict=True)]
             assert [bool(spans) for spans in lit] == [row_hz > 84e6, True]
-            clock.sleep(20e-6)  # less than a block of the stream
+            clock.sleep(20e-6)  # less than a block of the stream, and than the idle segment
             later = CardOutputs(card, 0)
             later.played(clock.now() - 10e-6)
             assert all(isinstance(span, RfTones) for spans in later.played(clock.now()) for span in spans)
@@ -341,6 +352,8 @@ def test_a_card_that_is_well_passes_and_stays_silent(driver: Any, mode: str) -> 
         lab.tweezers.self_test()
         assert not lab.card.running
         assert not lab.card.played(0)
+        if mode == "sequence":
+            assert not lab.card._machine.memory.segments[1].any()
         if mode == "replay":
             assert lab.card.memory.shape == (TEST_SAMPLES, 2)
             assert not lab.card.memory.any()
@@ -379,7 +392,7 @@ def test_a_clock_that_another_program_has_changed_is_reported(driver: Any) -> No
 
 def test_the_simulated_card_of_a_profile_keeps_only_the_last_program() -> None:
     clock = FakeClock()
-    tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated"), Context(clock=clock))
+    tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated", mode="replay"), Context(clock=clock))
     tweezers.open()
     assert isinstance(tweezers.library, SimulatedLibrary)
     card = tweezers.library.card
@@ -394,3 +407,12 @@ def test_the_simulated_card_of_a_profile_keeps_only_the_last_program() -> None:
         assert [span.start_s > starts_s[-1] for span in card.played(0)] == [True]
     tweezers.close()
     assert tweezers.library.card is None
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_rate_that_is_slow_to_render_is_reported_before_a_run(mode: str) -> None:
+    for rate_hz, n_warnings in ((624e6, 0), (625e6, 1)):
+        settings = SpcmSettings.model_validate({"card": "simulated", "mode": mode, "sample_rate": rate_hz})
+        warnings = SpcmMobileTweezers(settings, Context()).warnings()
+        assert len(warnings) == n_warnings
+        assert all("set sample_rate: 624 MHz" in text for text in warnings)

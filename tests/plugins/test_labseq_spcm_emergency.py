@@ -63,15 +63,16 @@ def tweezers(state, mode, speed_m_s, n_batches, trigger="software", fill=0.1, ke
         device.prepare(tone_program(plan, grid, motion, n_batches))
     return device
 
+parked = {"row_frequency": 10e6, "column_frequency": 10e6}
 devices = {
     # it plays for 0.7 s after the kill, which is longer than the script takes
     "fifo": tweezers("fifo", "fifo", 1e-5, 50, fill=0.5),
     "armed": tweezers("armed", "replay", 0.130, 2, "external"),
     "played": tweezers("played", "replay", 0.130, 1),
     "locked": tweezers("locked", "fifo", 1e-5, 50),
+    "sequence": tweezers("sequence", "sequence", 1.5e-5, 1, keep_warm=parked),  # it never ends
     "replay": tweezers("replay", "replay", 1.5e-5, 1),  # played last: its program lasts for 0.3 s
 }
-parked = {"row_frequency": 10e6, "column_frequency": 10e6}
 idle = {
     "prepared": tweezers("prepared", "replay", 0.130, 1),
     "stream": tweezers("stream", "stream", 0.130, 0, keep_warm=parked),  # a program could run dry
@@ -93,7 +94,7 @@ assert card.spcm.spcm_dwSetParam_i64(card._handle, 30010, 9000) == 0x101  # bloc
 print("on", flush=True)
 sys.stdin.read()
 """
-STATES = {"prepared", "armed", "played", "locked", "replay", "fifo", "stream"}
+STATES = {"prepared", "armed", "played", "locked", "replay", "sequence", "fifo", "stream"}
 OFF = "card stopped, outputs 0 and 1 disabled"
 
 
@@ -136,7 +137,8 @@ def test_a_card_goes_on_after_the_process_has_died(scope: Scope) -> None:
     """The reason for all of this: without the script the relays stay closed, and an edge starts a card."""
     assert set(scope.after_death) == STATES
     assert {relays for _, relays in scope.after_death.values()} == {(True, True)}
-    for state, is_running in {"fifo": True, "armed": True, "played": False, "prepared": False}.items():
+    running = {"fifo": True, "sequence": True, "armed": True, "played": False, "prepared": False}
+    for state, is_running in running.items():
         assert scope.after_death[state][0] == is_running
 
 
@@ -149,7 +151,7 @@ def test_a_plain_process_brings_its_outputs_to_zero(scope: Scope, state: str) ->
     for channel in (0, 1):
         end_s = scope.end_s(state, channel)
         assert end_s <= done.end_s
-        if state == "fifo":
+        if state in ("fifo", "sequence"):
             assert end_s > done.start_s, "it played until then"
     assert scope.again[state].text == done.text, "it can be repeated"
     assert not scope.heavy_modules

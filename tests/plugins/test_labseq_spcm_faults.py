@@ -21,6 +21,7 @@ from hypothesis.stateful import (
 )
 from labseq_spcm.library import VendorLibrary, load_spcm
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
+from labseq_spcm.play_sequence import SequenceReplay
 from labseq_spcm.replay_fifo import Fifo, Replay
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm.stream import Stream
@@ -33,8 +34,8 @@ from labseq.testing.fakes import FakeClock
 
 from .small_run import run
 
-MODES = ["replay", "fifo", "stream"]
-TRIGGERED = ["replay", "fifo"]
+MODES = ["replay", "sequence", "fifo", "stream"]
+TRIGGERED = ["replay", "sequence", "fifo"]
 
 
 def context(motion: MotionSpec | None = None) -> Context:
@@ -79,7 +80,7 @@ class TestCards:
             lab.play(lab.program())
 
 
-@pytest.mark.parametrize(("mode", "timeout_s"), [("replay", 0.0), ("fifo", 50e-3)])
+@pytest.mark.parametrize(("mode", "timeout_s"), [("replay", 0.0), ("sequence", 0.0), ("fifo", 50e-3)])
 def test_a_trigger_that_never_comes_times_out_into_the_safe_state(
     driver: Any, mode: str, timeout_s: float
 ) -> None:
@@ -93,7 +94,10 @@ def test_a_trigger_that_never_comes_times_out_into_the_safe_state(
         lab.tweezers.prepare(lab.program())
 
 
-@pytest.mark.parametrize(("mode", "player"), [("replay", Replay), ("fifo", Fifo), ("stream", Stream)])
+@pytest.mark.parametrize(
+    ("mode", "player"),
+    [("replay", Replay), ("sequence", SequenceReplay), ("fifo", Fifo), ("stream", Stream)],
+)
 def test_a_wait_during_which_another_thread_makes_the_card_safe_is_no_end_of_the_program(
     driver: Any, mode: str, player: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,7 +251,8 @@ def test_closing_goes_through_even_if_the_card_is_broken(driver: Any) -> None:
 @pytest.mark.parametrize(
     "mobile",
     [
-        "{use: spcm, card: simulated, sample_rate: 250 MHz}",
+        "{use: spcm, card: simulated, mode: replay, sample_rate: 250 MHz}",
+        "{use: spcm, card: simulated, mode: sequence, sample_rate: 250 MHz}",
         "{use: spcm, card: simulated, mode: fifo, sample_rate: 250 MHz}",
     ],
 )
@@ -273,6 +278,7 @@ LINE = (
 )
 
 
+@pytest.mark.parametrize("mode", ["replay", "sequence"])
 @pytest.mark.parametrize(
     ("n_edges", "text"),
     [
@@ -281,7 +287,7 @@ LINE = (
     ],
 )
 def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
-    tmp_path: Path, n_edges: int, text: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, n_edges: int, text: str, mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cards: list[Any] = []
     play = SpcmMobileTweezers.play
@@ -298,7 +304,7 @@ def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
     if n_edges == 0:
         monkeypatch.setattr(SimulatedCard, "trigger_at", lambda *_: None)
     with pytest.raises(DeviceError, match=text) as raised:
-        run(tmp_path, mobile=f"{{use: spcm, card: simulated, sample_rate: 250 MHz}}{LINE}")
+        run(tmp_path, mobile=f"{{use: spcm, card: simulated, mode: {mode}, sample_rate: 250 MHz}}{LINE}")
     assert (raised.value.device, raised.value.exit_code) == ("mobile_tweezers", 3)
     assert (cards[0].running, cards[0].outputs_on) == (False, (False, False))
 
@@ -318,7 +324,7 @@ def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
         ("mode: stream, card_buffer: 65536", 2, "at least twice notify_size, 131072"),
         (f"mode: stream}}{LINE[:-1]}", 2, "a line triggers it, but mode: stream"),
         (
-            "keep_warm: {row_frequency: 82 MHz, column_frequency: 118 MHz}",
+            "mode: replay, keep_warm: {row_frequency: 82 MHz, column_frequency: 118 MHz}",
             2,
             "keep_warm is set, but mode: replay leaves the AODs dark",
         ),
@@ -423,7 +429,7 @@ class Calls(RuleBasedStateMachine):
         self.stack = ExitStack()
         self.lab = self.stack.enter_context(driver(mode, trigger=trigger, fill=1e-3))
         self.is_open = self.safe = self.idle = True
-        self.streams = mode == "stream"
+        self.streams = mode in ("sequence", "stream")  # it plays silence between programs
 
     @rule(n_batches=st.sampled_from([1, 2, 24]))
     def prepare(self, n_batches: int) -> None:

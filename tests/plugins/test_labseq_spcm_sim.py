@@ -134,7 +134,7 @@ def joined(spans: list[RfSpan]) -> Samples:
     return np.concatenate([span.samples for span in sampled])
 
 
-@pytest.mark.parametrize(("mode", "row_channel"), [("replay", 1), ("fifo", 0)])
+@pytest.mark.parametrize(("mode", "row_channel"), [("replay", 1), ("sequence", 1), ("fifo", 0)])
 def test_samples_are_reported_in_pieces_that_fit_together_rows_first(
     driver: Any, mode: str, row_channel: int
 ) -> None:

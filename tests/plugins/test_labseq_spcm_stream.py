@@ -459,13 +459,3 @@ def test_the_driver_library_is_called_by_one_thread_at_a_time(mode: str) -> None
                 other.join(60.0)
         finally:
             tweezers.close()
-
-
-@pytest.mark.parametrize(("rate_hz", "warned"), [(624e6, 0), (625e6, 1)])
-def test_a_rate_that_is_slow_to_render_is_reported_before_a_run(
-    driver: Any, rate_hz: float, warned: int
-) -> None:
-    with driver("stream", sample_rate=rate_hz) as lab:
-        warnings = lab.tweezers.warnings()
-        assert len(warnings) == warned
-        assert all("set sample_rate: 624 MHz" in text for text in warnings)

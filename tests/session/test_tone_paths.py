@@ -105,10 +105,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("profile", "overrides"),
     [
         ("virtual", ()),
-        ("bench_awg", ()),
+        ("bench_awg", (f"{MOBILE}.mode=replay",)),
+        ("bench_awg", (f"{MOBILE}.mode=sequence",)),
         ("bench_awg", (f"{MOBILE}.mode=stream",)),
     ],
-    ids=["virtual", "replay", "stream"],
+    ids=["virtual", "replay", "sequence", "stream"],
 )
 def test_atoms_end_where_the_plan_says(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
     """On the simulation of the program, and of the samples that the card played."""
