@@ -27,6 +27,7 @@ SPARE: Final = 1
 UNWANTED: Final = 2
 STAYS: Final = 3
 
+# Chosen: n_bits counts the bits of four.
 MAX_ROWS: Final = 4
 """Maximum number of rows of a batch."""
 TOLERANCE: Final = 1e-9

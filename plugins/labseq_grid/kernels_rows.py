@@ -26,10 +26,13 @@ from labseq_grid.kernels_columns import (
     choose_columns,
 )
 
+# With 1 planning takes 0.7 times as long, and motion from 64 x 64 to 48 x 48 sites 8 % longer.
 STARTS: Final = 3
 """Number of pairs of rows to which others are added."""
+# With 20 planning of 64 x 64 sites takes a third longer, and plans are as good.
 BAND: Final = 10
 """Sources are no more columns from their goals, unless nothing else is left."""
+# This one and the three below shorten the search; they are chosen, not measured.
 NEAR: Final = 4
 """Rows that are added are no further from the source rows."""
 APART: Final = 1
