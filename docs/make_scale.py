@@ -26,13 +26,13 @@ from labseq_psca.planner import PscaPlanner, PscaSettings
 from labseq_rivals.planners import LineSettings, Mta1Planner, TetrisPlanner
 
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
-from labseq.geometry import pattern
 from labseq.model import CycleRecord, ImageRecord, PlanReport, RunRecord, ShotRecord
 from labseq.model.grid import centred_comb
 from labseq.motion import check_plan, tone_program
 from labseq.motion.rendering import Renderer
 from labseq.plain import now_utc
 from labseq.plugin import Context, Frame, MotionSpec, Occupancy, Plan, SiteGrid, TargetPattern, ToneProgram
+from labseq.plugin.geometry import pattern
 from labseq.plugin.motion import RfSpec
 from labseq.recording.writer import RunWriter
 

@@ -29,11 +29,11 @@ from labseq_virtual.simulation import VirtualSimulation
 
 from labseq import Session
 from labseq.assembly.recorded import machine_of_shot
-from labseq.geometry import pattern
 from labseq.model import LossSpec, MotionSpec
 from labseq.model.estimate import Estimate, mean
 from labseq.motion import check_plan, predict_survival, tone_program
 from labseq.plugin import Context, DepthRamp, RandomStream, SiteGrid
+from labseq.plugin.geometry import pattern
 
 PAGE: Final = Path(__file__).parent / "explanation" / "survival.md"
 EXPOSURE_S: Final = 45e-3

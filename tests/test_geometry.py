@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from pydantic import ValidationError
 
-from labseq.builtin.patterns import BitmapSettings, CompactSettings, bitmap, compact
+from labseq.builtin.patterns import BitmapSettings, CompactSettings, bitmap, compact, read_bitmap
 from labseq.errors import LimitError
-from labseq.geometry import from_the_centre, nearest_to_centre, place, read_bitmap
 from labseq.model import SiteGrid
+from labseq.plugin.geometry import from_the_centre, nearest_to_centre, place
 
 SIZES = st.integers(1, 12)
 

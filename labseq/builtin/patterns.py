@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from labseq.geometry import DrawingError, read_bitmap
 from labseq.messages import install_hint
 from labseq.plugin import ConfigError, FilePath, Problem, Settings, SiteGrid, TargetPattern, setting_error
 from labseq.plugin.geometry import check_size, pattern
@@ -24,6 +23,53 @@ MAX_BYTES: Final = 1 << 20
 """Largest file with a drawing, in bytes."""
 
 _HALF: Final = 128
+
+
+class DrawingError(ValueError):
+    """An error in a drawing.
+
+    Attributes:
+        line: The line of the text that is wrong, from 1; 0 for an error of the whole drawing.
+    """
+
+    def __init__(self, message: str, line: int = 0) -> None:
+        self.line = line
+        super().__init__(message)
+
+
+def read_bitmap(drawing: str, fill: str = "#") -> NDArray[np.bool_]:
+    """Read a drawing, one line per row; empty lines before and after it do not count.
+
+    Args:
+        drawing: The drawing.
+        fill: Characters that stand for an atom; all others stand for none.
+
+    Returns:
+        bool (rows, cols).
+
+    Raises:
+        DrawingError: The drawing is empty, holds no atom, or its rows differ in length.
+
+    Example:
+        >>> read_bitmap("#.#").astype(int).tolist()
+        [[1, 0, 1]]
+    """
+    lines = drawing.splitlines()
+    first = next((i for i, line in enumerate(lines) if line), len(lines))
+    drawn = "\n".join(lines[first:]).rstrip("\n").splitlines()
+    if not drawn:
+        raise DrawingError("the drawing is empty; draw rows such as '#.#', with '#' for an atom")
+    for row, line in enumerate(drawn, start=1):
+        if len(line) != len(drawn[0]):
+            raise DrawingError(
+                f"row {row} of the drawing has {len(line)} characters and row 1 has {len(drawn[0])}; "
+                "every row must have the same number",
+                first + row,
+            )
+    mask = np.array([[character in fill for character in line] for line in drawn], np.bool_)
+    if not mask.any():
+        raise DrawingError(f"the drawing holds no atom; draw an atom as one of '{fill}', or set `fill`")
+    return mask
 
 
 def read_drawing(path: Path, fill: str = "#") -> NDArray[np.bool_]:

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from labseq.drivers.leader import GO, LeaderLog, LeaderSettings, check_signal, load_atoms, load_until_go
+from collections import deque
+from typing import Final
+
+from pydantic import Field
+
+from labseq.errors import DeviceError, DeviceTimeoutError
+from labseq.roles import Context, Simulation
+from labseq.settings import Duration, PositiveDuration, Settings
+from labseq.units import format_quantity
 
 __all__ = [
     "GO",
@@ -12,3 +20,87 @@ __all__ = [
     "load_atoms",
     "load_until_go",
 ]
+
+GO: Final = "go"
+"""The start signal."""
+
+
+class LeaderSettings(Settings):
+    """Settings for any connection to another control system."""
+
+    deadline: PositiveDuration = Field(
+        default=10.0, description="longest time from `go` to `ready` or `failed`"
+    )
+    simulated_go_delay: Duration = Field(
+        default=0.5,
+        description="with a simulated control system: time after which it sends `go`; atoms load meanwhile",
+    )
+
+
+class LeaderLog:
+    """Messages about the other control system, for ``LeaderLink.new_events``."""
+
+    def __init__(self) -> None:
+        self._events: deque[str] = deque(maxlen=100)  # a noisy line must not fill the memory
+
+    def note(self, text: str) -> None:
+        """Keep a message."""
+        self._events.append(text)
+
+    def note_refused(self) -> None:
+        """`go` came during a shot."""
+        self.note("`go` came while labseq was busy, and was refused")
+
+    def note_unawaited(self) -> None:
+        """The deadline of a `go` has passed before a step waited for it."""
+        self.note("no step waited for `go` before its deadline; the leader received `failed`")
+
+    def note_late(self) -> None:
+        """The deadline of a `go` has passed during its shot."""
+        self.note("the shot is not over at the deadline; the leader received `failed`")
+
+    def new_events(self) -> list[str]:
+        """The messages since the last call."""
+        new_events = [*self._events]
+        self._events.clear()
+        return new_events
+
+
+def check_signal(signal: str, device: str) -> None:
+    """Refuse to wait for anything but `go`.
+
+    Raises:
+        DeviceError: It is another signal.
+    """
+    if signal != GO:
+        raise DeviceError(device, f"unknown signal '{signal}'; expected '{GO}'")
+
+
+def load_until_go(context: Context, delay_s: float, timeout_s: float) -> None:
+    """Do what a simulated control system does before it sends `go`: load the atoms.
+
+    Args:
+        context: That of the device.
+        delay_s: How long that takes, in seconds of the session's clock.
+        timeout_s: How long the device waits for `go`.
+
+    Raises:
+        DeviceTimeoutError: `go` comes too late.
+    """
+    if delay_s > timeout_s:
+        context.clock.sleep(timeout_s)
+        text = f"the simulated leader says '{GO}' after {format_quantity(delay_s, 'time')}"
+        raise DeviceTimeoutError(context.name, f"{text}; see 'simulated_go_delay'", timeout_s)
+    load_atoms(context, delay_s)
+
+
+def load_atoms(context: Context, duration_s: float) -> None:
+    """Load the simulated lab as the other control system would have, unless this shot has atoms already.
+
+    At a second wait in a shot these are the rearranged atoms.
+    """
+    start_s = context.clock.now()
+    context.clock.sleep(duration_s)
+    simulation: Simulation | None = context.simulation
+    if simulation is not None and ((truth := simulation.truth()) is None or not truth.any()):
+        simulation.load(start_s, duration_s)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.drivers.tweezers import check_amplitudes, check_ramp, check_tone_program
 from labseq.errors import LimitError
 from labseq.model import Plan, ToneProgram
 from labseq.motion import tone_program
+from labseq.plugin.tweezers import check_amplitudes, check_ramp, check_tone_program
 
 BANDS = (82e6, 118e6), (80e6, 120e6)
 PROGRAM = tone_program(Plan.from_batches([([(0, 0), (0, 2)], [(0, 3), (0, 5)]), ([(2, 1)], [(4, 1)])]))

@@ -17,9 +17,9 @@ from labseq_virtual.tone_positions import FrequencyMap, TonePositions
 from numpy.typing import NDArray
 
 from labseq import Batch, LimitError, MotionSpec, Plan, SiteGrid, check_plan, tone_program
-from labseq.geometry import pattern
 from labseq.model import ToneProgram
 from labseq.model.motion import SpeedProfile
+from labseq.plugin.geometry import pattern
 from labseq.testing.fakes import OneByOnePlanner
 
 from .rf import ON, PROGRAM_GRID as GRID, ToneProgramBuilder

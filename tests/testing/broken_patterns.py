@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from labseq.geometry import block, pattern
 from labseq.model import SiteGrid, TargetPattern
+from labseq.plugin.geometry import block, pattern
 from labseq.testing import PatternContract
 
 from .planted import Planted
