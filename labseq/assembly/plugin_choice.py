@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -134,21 +134,23 @@ def find_entry(
 
 
 def read_settings(
-    document: Document, entry: Entry, loc: tuple[str | int, ...], drop: frozenset[str] = frozenset()
+    document: Document, entry: Entry, loc: Loc, core_keys: Collection[str] = ()
 ) -> Settings | None:
     """The settings of an entry, validated; None if it takes none.
+
+    Args:
+        core_keys: Keys of the mapping that labseq reads itself.
 
     Raises:
         ConfigError: They are invalid, or the plugin's own validators fail; with their place.
     """
-    other_keys = sorted(drop - {"use", "pattern"})
     called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
     try:
         settings = call_plugin(
             entry.owner,
             f"the settings model of {called}",
             lambda: document.validate(
-                entry.settings_model or NoSettings, loc, drop=drop, other_keys=other_keys, called=called
+                entry.settings_model or NoSettings, loc, core_keys=core_keys, called=called
             ),
         )
     except PluginLoadError as error:

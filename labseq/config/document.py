@@ -239,23 +239,21 @@ class Document:
         model: type[M],
         loc: Loc = (),
         *,
-        drop: Collection[str] = (),
-        other_keys: Collection[str] = (),
+        core_keys: Collection[str] = (),
         called: str = "",
     ) -> M:
         """Validate the mapping at a location against a settings model; an empty or missing one counts as {}.
 
         Args:
             loc: Location of the mapping.
-            drop: Keys that belong to another model and are left out.
-            other_keys: Further known keys, for messages about misspelt ones.
+            core_keys: Keys that belong to another model and are left out.
             called: Name of the mapping in messages: "camera 'andor'"; "" for its key.
 
         Raises:
             ConfigError: All errors in the mapping, in file order.
         """
         name = next((step for step in reversed(loc) if isinstance(step, str)), "")
-        context = ValidationContext(name, called, drop, other_keys, self.path.parent, needs_units=True)
+        context = ValidationContext(name, called, core_keys, self.path.parent, needs_units=True)
         node = self.root.at(loc) or Node({}, self.root.mark_at(loc))
         return validate(model, node, context)
 

@@ -50,16 +50,14 @@ class ValidationContext:
     Attributes:
         name: Name of the mapping in messages; "" at the top of a file.
         called: Its description in messages; "" for its name.
-        drop: Keys that are left out.
-        other_keys: Keys that belong to another model: messages list them as known.
+        core_keys: Keys that belong to another model and are left out; messages list them as known.
         folder: Folder that the paths in it are relative to.
         needs_units: Whether a quantity needs its unit, as in a file; otherwise numbers are in SI.
     """
 
     name: str
     called: str = ""
-    drop: Collection[str] = ()
-    other_keys: Collection[str] = ()
+    core_keys: Collection[str] = ()
     folder: Path = Path()
     needs_units: bool = False
 
@@ -67,7 +65,9 @@ class ValidationContext:
         """The keys of the mapping at a location."""
         keys = [setting.key for one in models_at(model, loc) for setting in settings_of(one)]
         if not loc:
-            keys = [*(key for key in keys if key not in self.drop), *self.other_keys]
+            # the key that names the plugin is right, or its settings would not be looked at
+            others = sorted({*self.core_keys} - {"use", "pattern"})
+            keys = [*(key for key in keys if key not in self.core_keys), *others]
         return list(dict.fromkeys(keys))
 
     def mapping(self, loc: Loc) -> str:
@@ -103,7 +103,7 @@ def check(model: type[M], node: Node, context: ValidationContext) -> M | list[Fi
     if not isinstance(data, dict):
         what = f"{context.name} is {shown(data, node.raw)}"
         return [Finding((), Problem(what, expected="a mapping of settings such as {key: value}"))]
-    kept = {key: value for key, value in cast("dict[str, Any]", data).items() if key not in context.drop}
+    kept = {key: value for key, value in cast("dict[str, Any]", data).items() if key not in context.core_keys}
     try:
         return _validated(model, json.dumps(kept), {FOLDER: context.folder, NEEDS_UNITS: context.needs_units})
     except ValidationError as error:

@@ -33,6 +33,8 @@ LASTING: Final = frozenset(
     }
 )
 """Events that must stay on the screen above the live view."""
+PRINTED: Final = LASTING | {"shot_finished", "scan_point", "scan_ended"}
+"""Events that have a line where there is no live view."""
 
 
 class LogLines:
@@ -42,9 +44,9 @@ class LogLines:
         events: Names of the events that are printed; without a live view, also how each shot ended.
     """
 
-    def __init__(self, stream: TextIO, events: frozenset[str] | None = None) -> None:
+    def __init__(self, stream: TextIO, events: frozenset[str] = PRINTED) -> None:
         self._stream = stream
-        self._events = events or LASTING | {"shot_finished", "scan_point", "scan_ended"}
+        self._events = events
         self._run: RunRecord | None = None
         self._results: list[MeasuredResults] = []
 
@@ -57,8 +59,7 @@ class LogLines:
             self._results = [
                 MeasuredResults(run_dir, *split) for split in map(split_result, names) if split is not None
             ]
-        text = event_text(name, values, self._run) if name in self._events else ""
-        if text:
+        if name in self._events and (text := event_text(name, values, self._run)):
             say(text, stream=self._stream)
         if name in ("shot_finished", "run_finished"):
             for results in self._results:

@@ -97,10 +97,9 @@ class Shot:
     @property
     def occupancies(self) -> NDArray[np.bool_]:
         """The detected occupancies, bool (n_images, n_rows, n_cols)."""
-        from labseq.recording.shot_file import (
-            read_occupancies,
-        )  # a seventh of the time that the whole file takes
+        from labseq.recording.shot_file import read_occupancies
 
+        # a seventh of the time that the whole file takes
         return read_occupancies(self.file)[1].astype(np.bool_)
 
     @property
@@ -123,7 +122,8 @@ class Shot:
     @property
     def confidences(self) -> NDArray[np.float32]:
         """The detector's confidence, float32 (n_images, n_rows, n_cols)."""
-        return self._of_each_image("confidence", np.float32)
+        shape = (len(self.images), *self._content.target.shape)
+        return np.array([image.confidence for image in self.images], np.float32).reshape(shape)
 
     @property
     def target(self) -> TargetPattern:
@@ -229,8 +229,3 @@ class Shot:
     @property
     def _content(self) -> ShotContent:
         return self._load(self.file)
-
-    def _of_each_image(self, name: str, dtype: Any) -> NDArray[Any]:
-        images = self._content.record.images
-        shape = (len(images), *self._content.target.shape)
-        return np.array([getattr(image, name) for image in images], dtype).reshape(shape)

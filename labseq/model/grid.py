@@ -264,32 +264,24 @@ def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) 
     """
     wanted = np.dtype(dtype)
     array: NDArray[Any] = np.asarray(values)
-    if array.dtype == wanted and (array.shape == shape or _fits(array.shape, shape)):
-        flags = array.flags
-        if not flags.writeable and flags.c_contiguous:
-            return array
-    if array.dtype != wanted:
-        if array.size == 0:
-            array = array.astype(wanted)
-        else:
-            converted = array.astype(wanted)
-            if not np.array_equal(converted, array):
-                raise ValueError(f"{name} holds values that {wanted} cannot represent")
-            array = converted
-    if array.size == 0 and 0 not in shape and array.ndim != len(shape):
-        array = array.reshape(tuple(0 if n == -1 else n for n in shape))
-    if not _fits(array.shape, shape):
+    is_ready = array.dtype == wanted and _fits(array.shape, shape)
+    if is_ready and array.flags.c_contiguous and not array.flags.writeable:
+        return array
+    copy = array.astype(wanted, order="C")
+    if array.dtype != wanted and not np.array_equal(copy, array):
+        raise ValueError(f"{name} holds values that {wanted} cannot represent")
+    if copy.size == 0 and 0 not in shape and copy.ndim != len(shape):  # [] for no rows of several columns
+        copy = copy.reshape(tuple(0 if n == -1 else n for n in shape))
+    if not _fits(copy.shape, shape):
         wanted_text = "(" + ", ".join("n" if n == -1 else str(n) for n in shape) + ")"
-        raise ValueError(f"{name} has shape {array.shape}; expected {wanted_text}")
-    if array.flags.writeable or not array.flags.c_contiguous:
-        array = np.array(array, dtype=wanted, order="C", copy=True)
-        array.flags.writeable = False
-    return array
+        raise ValueError(f"{name} has shape {copy.shape}; expected {wanted_text}")
+    copy.flags.writeable = False
+    return copy
 
 
 def _fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
-    if len(shape) != len(wanted):
-        return False
+    if shape == wanted or len(shape) != len(wanted):
+        return shape == wanted
     for have, want in zip(shape, wanted, strict=True):  # noqa: SIM110 - all() takes three times as long
         if want not in (-1, have):
             return False

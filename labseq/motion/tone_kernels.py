@@ -306,7 +306,7 @@ def tone_at(sites: Sites, place: float) -> tuple[float, float]:
 
 @helper_kernel(
     f"int64(float64[:, ::1], int64, {SITES_OF_AXIS}, {BATCH}, int64, int64, float64, float64, float64,"
-    " float64, float64[::1])"
+    " float64[::1])"
 )
 def add_path_tones(
     values: Floats,
@@ -317,7 +317,6 @@ def add_path_tones(
     to_knot: int,
     start: float,
     end: float,
-    rest: float,
     duration_s: float,
     phase: Floats,
 ) -> int:
@@ -330,9 +329,9 @@ def add_path_tones(
         of: The batch.
         knot: Where the segment starts.
         to_knot: Where it ends.
-        start: Amplitude at the start of tones that go off at ``to_knot``, relative to that of their place.
+        start: Amplitude at the start of tones that go off at ``to_knot``, relative to that of their place,
+            which all others have.
         end: The same at the end.
-        rest: The same for tones that go off later.
         duration_s: Duration of the segment.
         phase: float64 (>= n_tones,), phases in cycles; advanced to the segment's end.
     """
@@ -345,8 +344,8 @@ def add_path_tones(
         end_hz, end_amplitude = tone_at(sites, position(positions, shape, axis, to_knot, k))
         values[START_HZ, n] = start_hz
         values[END_HZ, n] = end_hz
-        values[START_AMPLITUDE, n] = start_amplitude * (start if goes_off == to_knot else rest)
-        values[END_AMPLITUDE, n] = end_amplitude * (end if goes_off == to_knot else rest)
+        values[START_AMPLITUDE, n] = start_amplitude * (start if goes_off == to_knot else 1.0)
+        values[END_AMPLITUDE, n] = end_amplitude * (end if goes_off == to_knot else 1.0)
         values[PHASE, n] = phase[k]
         phase[k] = (phase[k] + 0.5 * (start_hz + end_hz) * duration_s) % 1.0
         n += 1
@@ -379,11 +378,11 @@ def add_path_batch(
     last, ramped = shape[0] - 1, axis == 0
     if pause_s > 0.0:
         m = add_segment(segments, m, IDLE, LINEAR, batch, pause_s, n)
-    if pick_up_s > 0.0:  # no tone goes off at knot 0, so that all are among the rest
+    if pick_up_s > 0.0:
         part = level(keyed_up_s, pick_up_s, ramped)
         for start, end, took_s in ((0.0, part, keyed_up_s), (part, 1.0, pick_up_s - keyed_up_s)):
             first = n
-            n = add_path_tones(values, n, sites, of, 0, 0, 1.0, 1.0, 1.0, took_s, phase)
+            n = add_path_tones(values, n, sites, of, 0, 0, 1.0, 1.0, took_s, phase)
             values[START_AMPLITUDE, first:n] *= start
             values[END_AMPLITUDE, first:n] *= end
             m = add_segment(segments, m, PICK_UP, LINEAR, batch, took_s, n)
@@ -391,18 +390,18 @@ def add_path_batch(
     for leg in range(last):
         took_s, at = ways[leg] * site_s, leg + 1
         if took_s > 0.0:
-            n = add_path_tones(values, n, sites, of, leg, at, 1.0, 1.0, 1.0, took_s, phase)
+            n = add_path_tones(values, n, sites, of, leg, at, 1.0, 1.0, took_s, phase)
             m = add_segment(segments, m, TRANSPORT, course, batch, took_s, n)
         if drop_off_s == 0.0 or not (off == at).any():
             continue
         if at < last:
-            n = add_path_tones(values, n, sites, of, at, at, 1.0, 0.0, 1.0, drop_off_s, phase)
+            n = add_path_tones(values, n, sites, of, at, at, 1.0, 0.0, drop_off_s, phase)
             m = add_segment(segments, m, DROP_OFF, LINEAR, batch, drop_off_s, n)
             continue
         part, ramp_s = level(keyed_down_s, drop_off_s, ramped), drop_off_s - keyed_down_s
-        n = add_path_tones(values, n, sites, of, at, at, 1.0, part, 1.0, ramp_s, phase)
+        n = add_path_tones(values, n, sites, of, at, at, 1.0, part, ramp_s, phase)
         m = add_segment(segments, m, DROP_OFF, LINEAR, batch, ramp_s, n)
-        n = add_path_tones(values, n, sites, of, at, at, part, 0.0, 1.0, keyed_down_s, phase)
+        n = add_path_tones(values, n, sites, of, at, at, part, 0.0, keyed_down_s, phase)
         m = add_segment(segments, m, DROP_OFF, LINEAR, batch, keyed_down_s, n)
     return m, n
 

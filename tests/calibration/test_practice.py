@@ -48,8 +48,8 @@ class Practice:
             text = text.replace(old, new)
         self.profile.write_text(text, "utf-8")
         document, spec = load_profile(str(self.profile))
-        physics = document.validate(SimulationSettings, ("simulation",), drop={"use"})
-        self.detector = document.validate(ThresholdSettings, ("detector",), drop={"use"})
+        physics = document.validate(SimulationSettings, ("simulation",), core_keys={"use"})
+        self.detector = document.validate(ThresholdSettings, ("detector",), core_keys={"use"})
         self.grid, self.image = spec.grid_model(), physics.image
         self.random = RandomStream(2026)
         self.world = VirtualSimulation(physics, Context("simulation", self.grid, random=self.random))

@@ -72,7 +72,7 @@ def test_profiles(path: Path, data: bytes) -> None:
         document, spec = load_profile(path)
         spec.grid_model()
         for choice in spec.choices.values():
-            document.validate(NoSettings, choice.loc, drop=document.get(choice.loc))
+            document.validate(NoSettings, choice.loc, core_keys=document.get(choice.loc))
 
     load_or_report(load, data.count(b"\n") + data.count(b"\r"))
 

@@ -23,7 +23,7 @@ from labseq.config.profile import (
 from labseq.errors import ConfigError
 from labseq.model import CALIBRATION_KINDS, LineSpec, MotionSpec, SiteGrid
 from labseq.model.policies import Timeouts
-from labseq.settings import Settings, settings_of
+from labseq.settings import Settings
 from tests.config.wrong_files import wrong_files
 
 DATA = Path(__file__).parent / "data"
@@ -70,14 +70,13 @@ def test_motion_keys_and_the_plugin_s_share_a_mapping(loaded: tuple[Document, Pr
         band_centre: str = ""
 
     document, spec = loaded
-    loc, drop = spec.mobile_tweezers.loc, spec.mobile_tweezers.core_keys
-    other_keys = [setting.key for setting in settings_of(MotionSpec)]
-    assert document.validate(Plugin, loc, drop=drop, other_keys=other_keys).band_centre == "100 MHz"
+    loc, core_keys = spec.mobile_tweezers.loc, spec.mobile_tweezers.core_keys
+    assert document.validate(Plugin, loc, core_keys=core_keys).band_centre == "100 MHz"
     wrong = document.override("mobile_tweezers.sped", "1", "--set")
     with pytest.raises(
-        ConfigError, match=r"^--set: 'sped' is not a .* one of band_centre, pick_up,.* 'speed'\?$"
+        ConfigError, match=r"^--set: 'sped' is not a .* one of band_centre, clearance,.* 'speed'\?$"
     ):
-        wrong.validate(Plugin, loc, drop=drop, other_keys=other_keys)
+        wrong.validate(Plugin, loc, core_keys=core_keys)
 
 
 def test_what_may_be_left_out() -> None:

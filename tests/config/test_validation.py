@@ -198,8 +198,8 @@ def test_misspelt_key_is_not_missing_as_well() -> None:
 
 
 def test_dropped_keys_are_left_out_and_not_offered() -> None:
-    assert validate("  use: psca\n  speed: fast\n", drop={"use", "speed"}).rows == 1
-    (problem,) = problems("  user: x", drop={"use"}, other_keys=["speed"])
+    assert validate("  use: psca\n  speed: fast\n", core_keys={"use", "speed"}).rows == 1
+    (problem,) = problems("  user: x", core_keys={"use", "speed"})
     assert "did you mean" not in problem
     assert ", speed" in problem
     assert "use," not in problem
@@ -207,9 +207,9 @@ def test_dropped_keys_are_left_out_and_not_offered() -> None:
 
 def test_nothing_to_set() -> None:
     document = Document.parse("camera: {use: x, gain: 3}", "f.yaml")
-    document.validate(NoSettings, ("camera",), drop={"use", "gain"})
+    document.validate(NoSettings, ("camera",), core_keys={"use", "gain"})
     with pytest.raises(ConfigError) as caught:
-        document.validate(NoSettings, ("camera",), drop={"use"})
+        document.validate(NoSettings, ("camera",), core_keys={"use"})
     assert str(caught.value).startswith("f.yaml:1:18: ")
     assert "'gain'" in str(caught.value)
 

@@ -45,7 +45,7 @@ def test_the_virtual_profile_states_the_defaults() -> None:
     assert all(choice.use == "virtual" for role, choice in profile.choices.items() if role != "detector")
     for role, model in MODELS.items():
         core_keys = {one.key for one in settings_of(MobileTweezersChoice)}
-        read = document.validate(model, (role,), drop=core_keys)
+        read = document.validate(model, (role,), core_keys=core_keys)
         stated, default = flat(read.model_dump()), flat(model().model_dump())
         if role == "simulation":  # the profile says what the machine is; by default it is what the grid says
             for axis in ("row_tones", "column_tones"):
@@ -56,7 +56,7 @@ def test_the_virtual_profile_states_the_defaults() -> None:
         for key, value in default.items():
             expected = pytest.approx(value) if isinstance(value, float) else value
             assert stated[key] == expected, f"{role}.{key}"
-    shutter = document.validate(DeviceSettings, ("devices", "shutter"), drop={"use"})
+    shutter = document.validate(DeviceSettings, ("devices", "shutter"), core_keys={"use"})
     assert shutter.commands == ("open", "close")
 
 
@@ -69,8 +69,8 @@ def test_the_profiles_describe_the_papers_machine(name: str) -> None:
     np.testing.assert_allclose(grid.positions_m, paper.positions_m)
     np.testing.assert_allclose(grid.row_frequency_hz, paper.row_frequency_hz)
     np.testing.assert_allclose(grid.column_frequency_hz, paper.column_frequency_hz)
-    assert document.validate(ThresholdSettings, ("detector",), drop={"use"}) == ThresholdSettings()
-    assert document.validate(SimulationSettings, ("simulation",), drop={"use"}).lifetime == 33.0
+    assert document.validate(ThresholdSettings, ("detector",), core_keys={"use"}) == ThresholdSettings()
+    assert document.validate(SimulationSettings, ("simulation",), core_keys={"use"}).lifetime == 33.0
 
 
 def test_camera_and_detector_agree_on_where_the_atoms_are() -> None:
