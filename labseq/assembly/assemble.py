@@ -149,21 +149,23 @@ def assemble(
     # at the points of a scan, the errors of the files would be found again
     scan = None if problems.problems else scan
     try:
-        hardware = resolve_profile(
-            sequence.profile if profile is None else profile,
-            for_profile,
-            dry_run,
-            named_in=document if profile is None else None,
-            plugin_folders=plugin_paths(document, sequence.plugin_folders),
-            scan=scan,
-            problems=problems,
-            recorded=recorded,
-        )
+        try:
+            hardware = resolve_profile(
+                sequence.profile if profile is None else profile,
+                for_profile,
+                dry_run,
+                named_in=document if profile is None else None,
+                plugin_folders=plugin_paths(document, sequence.plugin_folders),
+                scan=scan,
+                problems=problems,
+                recorded=recorded,
+            )
+        except ConfigError as error:
+            _check_alone(document, sequence, problems)
+            raise problems.stop(error) from None
+        return _assembled(document, sequence, hardware, scan, problems)
     except ConfigError as error:
-        _check_alone(document, sequence, problems)
-        error = problems.stop(error)
         raise (error if scan is None else scan.explained(error)) from None
-    return _assembled(document, sequence, hardware, scan, problems)
 
 
 def assemble_recorded(recorded: RecordedFiles, options: Options) -> Assembly:
@@ -179,13 +181,19 @@ def _assembled(
     scan: Scan | None,
     problems: ProblemCollector,
 ) -> Assembly:
-    """Make the target, planner, steps and analyses of a sequence on its profile."""
+    """Make the target, planner, steps and analyses of a sequence on its profile.
+
+    Raises:
+        ConfigError: All problems, those that were collected before among them.
+    """
     is_whole = not problems.problems
-    objects: dict[str, Any] = {}
+    target: TargetPattern | None = None
+    planner: ChosenPlugin | None = None
+    target_dump: dict[str, Any] | None = None
     with problems:
-        objects["target"], objects["target_dump"] = make_target(hardware, document, sequence)
+        target, target_dump = make_target(hardware, document, sequence)
     with problems:
-        objects["planner"] = resolve(hardware.host, document, "planner", sequence.planner)
+        planner = resolve(hardware.host, document, "planner", sequence.planner)
     steps, step_dumps = make_steps(hardware, document, sequence, problems)
     analyses, results = make_analyses(hardware, document, sequence, problems)
     if sequence.measure or sequence.policy.checks or sequence.scan:
@@ -194,37 +202,31 @@ def _assembled(
         is_known = is_whole and len(steps) == len(sequence.shot)
         results = [*results, *readings_of(hardware, steps, is_whole=is_known)]
     # quantities may name regions, which a file with errors may have lost
-    target = objects.get("target") if is_whole else None
-    policy, policy_dumps = make_policy(document, sequence, steps, results, target, problems)
-    measures = make_measures(document, sequence, steps, target, results, scan, hardware.host, problems)
+    regions_of = target if is_whole else None
+    policy, policy_dumps = make_policy(document, sequence, steps, results, regions_of, problems)
+    measures = make_measures(document, sequence, steps, regions_of, results, scan, hardware.host, problems)
     scanned: ScanPoints | None = None
     search: Search | None = None
-    try:
-        if scan is not None and is_whole:
-            # a run without a scan does not need these
-            from labseq.assembly.points import ScanPoints
-            from labseq.assembly.search import make_search
+    if scan is not None and is_whole:
+        # a run without a scan does not need these
+        from labseq.assembly.points import ScanPoints
+        from labseq.assembly.search import make_search
 
-            scanned = ScanPoints(scan.bound(hardware.document), document, sequence, hardware)
-            scanned.check(problems)
-            search = make_search(scanned, steps, results, target, problems)
-        problems.raise_any()
-    except ConfigError as error:
-        raise (error if scan is None else scan.explained(error)) from None
-    target, planner = objects["target"], objects["planner"]
-    resolved = {
-        **sequence.model_dump(
-            mode="json", exclude={"shot", "target", "planner", "scan", "measure", "regions"}
-        ),
+        scanned = ScanPoints(scan.bound(hardware.document), document, sequence, hardware)
+        scanned.check(problems)
+        search = make_search(scanned, steps, results, target, problems)
+    problems.raise_any()
+    assert target is not None  # else there was a problem
+    assert planner is not None
+    chosen = {
         "measure": measures,
-        "target": objects["target_dump"],
+        "target": target_dump,
         "planner": planner.dump(),
         "shot": [step | own for step, own in zip(step_dumps, policy_dumps, strict=True)],
         "analysis": analyses,
         "profile": _profile_dump(hardware),
     }
-    optional = {"regions": plain_regions(target), "expressions": _expressions(document, hardware.document)}
-    resolved |= {key: value for key, value in optional.items() if value}
+    resolved = _core_dump(sequence) | chosen | _optional_dump(target, document, hardware.document)
     parts = (document, sequence, hardware, target, planner, tuple(steps), resolved)
     return Assembly(*parts, scanned, policy=policy, search=search)
 
@@ -244,13 +246,24 @@ def _check_alone(document: Document, sequence: SequenceSpec, problems: ProblemCo
                     read_settings(document, entry, spec.loc)
 
 
-def _expressions(sequence: Document, profile: Document) -> dict[str, str]:
-    """Address -> text of each expression; the record of the run has its value among the settings."""
-    return {
+def _core_dump(sequence: SequenceSpec) -> dict[str, Any]:
+    """What a sequence says apart from its plugins, its scan and its quantities."""
+    others = {"shot", "target", "planner", "scan", "measure", "regions"}
+    return sequence.model_dump(mode="json", exclude=others)
+
+
+def _optional_dump(target: TargetPattern, sequence: Document, profile: Document) -> dict[str, Any]:
+    """The sites of each region, and address -> text of each expression; none where a file has none.
+
+    The record of the run has the values of the expressions among the settings.
+    """
+    expressions = {
         prefix + ".".join(map(str, loc)): text
         for prefix, document in (("", sequence), (PROFILE, profile))
         for loc, text in (document.expressions.texts.items() if document.expressions else ())
     }
+    optional = {"regions": plain_regions(target), "expressions": expressions}
+    return {key: value for key, value in optional.items() if value}
 
 
 def _profile_dump(hardware: ResolvedProfile) -> dict[str, Any]:
