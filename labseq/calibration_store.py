@@ -1,4 +1,4 @@
-"""Stores calibrations on disk, records which are in use, and judges whether one is worse than another."""
+"""Stores calibrations on disk, and records which are in use."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import labseq
 from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.files import make_folder, read_file, whole_file
 from labseq.messages import visible
-from labseq.model import CalibrationEntry, CalibrationKind, SiteGrid, grid_facts, same_grid
+from labseq.model import CalibrationEntry, CalibrationKind, SiteGrid, grid_facts
 from labseq.plain import now, now_utc, parse_object
 from labseq.units import format_quantity
 
@@ -155,76 +155,6 @@ def encode_history(history: list[Activation]) -> bytes:
     head = json.dumps({"format": ACTIVE_FORMAT, "format_version": FORMAT_VERSION})
     rows = ",\n".join(f"  {json.dumps(asdict(activation))}" for activation in history)
     return f'{head[:-1]},\n "history": [\n{rows}\n ]\n}}\n'.encode()
-
-
-WORSE_FACTOR: Final = 1.5
-"""Quality figures whose ratio is below this factor may differ by chance."""
-
-
-@dataclass(frozen=True, slots=True)
-class QualityFigure:
-    """The figure by which calibrations of a kind are compared; lower is better.
-
-    Attributes:
-        figure: Its name in ``quality``.
-        good_enough: An entry with this figure or less is never worse.
-        label: Its name for the user.
-    """
-
-    figure: str
-    good_enough: float
-    label: str
-
-
-DECIDING: Final[Mapping[str, QualityFigure]] = {
-    # With sites known less well than a tenth of a pixel, the region of interest loses light.
-    "sites": QualityFigure("residual_px", 0.1, "residual"),
-    # Twice the paper's mean detection infidelity of 0.054 %.
-    "thresholds": QualityFigure("error", 1e-3, "expected error"),
-    # The goal of the step `equalise`.
-    "tweezers": QualityFigure("separable_spread", 5e-3, "separable spread"),
-    "amplitudes": QualityFigure("separable_spread", 5e-3, "separable spread"),
-    # A twentieth of the mobile tweezers' waist: the losses that it causes are too few to measure.
-    "frequencies": QualityFigure("error_m", 50e-9, "error"),
-    "overlay": QualityFigure("error_m", 50e-9, "error"),
-    # Ten times the goal for a card that streams.
-    "timing": QualityFigure("p99_s", 25e-3, "99th percentile"),
-}
-"""Kind -> the quality figure by which its calibrations are compared."""
-
-
-def figure_of(entry: CalibrationEntry) -> float:
-    """The deciding figure of an entry; nan if it has none."""
-    return entry.quality.get(DECIDING[entry.kind].figure, math.nan)
-
-
-def why_worse(new: CalibrationEntry, old: CalibrationEntry | None) -> str:
-    """The reason why a calibration is worse than another of its kind and must not replace it; "" if it may.
-
-    It is worse if its deciding figure is more than :data:`WORSE_FACTOR` times the other's and more
-    than good enough, if only the other has such a figure, or if it found fewer sites. Thresholds of which
-    more sites than before take a peak from their neighbours are refused even if none are in use.
-
-    Args:
-        new: The new calibration.
-        old: The one in use, or None. One for another grid may always be replaced.
-    """
-    old = old if old is not None and same_grid(new.grid, old.grid) else None
-    n_one_peak = new.quality.get("n_one_peak", 0.0)
-    if n_one_peak > (old.quality.get("n_one_peak", 0.0) if old is not None else 0.0):
-        sites = "at 1 site" if n_one_peak == 1 else f"at {n_one_peak:.0f} sites"
-        return f"{sites} only one peak was found; the thresholds there would be borrowed from neighbours"
-    if old is None:
-        return ""
-    deciding, now, before = DECIDING[new.kind], figure_of(new), figure_of(old)
-    if math.isnan(now) and not math.isnan(before):
-        return f"it has no quality figure ({deciding.figure}), and the one in use has"
-    if not math.isnan(before) and now > max(deciding.good_enough, WORSE_FACTOR * before):
-        return f"its {deciding.figure} is {now:.3g}, that of the one in use {before:.3g}"
-    n_found, n_found_before = (entry.quality.get("n_sites_found", math.nan) for entry in (new, old))
-    if n_found < n_found_before:
-        return f"it found {n_found:.0f} sites, the one in use {n_found_before:.0f}"
-    return ""
 
 
 def check_grid(entry: CalibrationEntry, grid: SiteGrid, source: str) -> None:
@@ -397,17 +327,14 @@ class Store:
             raise damaged(path, f"{active.id} was put to use as '{kind}', and this is another calibration")
         return Stored(entry, path)
 
-    def use(self, stored: Stored, grid: SiteGrid, *, force: bool = False) -> None:
-        """Put an entry to use from now on; with ``force`` even if it is worse than the one in use.
+    def use(self, stored: Stored, grid: SiteGrid) -> None:
+        """Put an entry to use from now on.
 
         Raises:
-            ConfigError: It is for another grid, it is worse, or the folder cannot be written to.
+            ConfigError: It is for another grid, or the folder cannot be written to.
         """
         entry = stored.entry
         check_grid(entry, grid, str(stored.path))
-        if not force and (reason := self.why_worse(entry)):
-            message = f"{entry.kind} {entry.id} is worse than the one in use: {reason}"
-            raise ConfigError(Problem(message, hint="use it anyway with --force"))
         self._activate(Activation(entry.kind, entry.id, stored.path.name, now_utc("seconds")))
 
     def use_none(self, kind: CalibrationKind) -> None:
@@ -417,14 +344,6 @@ class Store:
             ConfigError: The folder cannot be written to.
         """
         self._activate(Activation(kind, "", "", now_utc("seconds")))
-
-    def why_worse(self, entry: CalibrationEntry) -> str:
-        """Why an entry must not replace the one in use; "" if it may. A damaged one is always replaced."""
-        try:
-            stored = self.entry_in_use(entry.kind)
-        except ConfigError:
-            return ""
-        return why_worse(entry, None if stored is None else stored.entry)
 
     def _activate(self, activation: Activation) -> None:
         """Add an activation to the history, unless nothing changes."""

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from labseq import calibration_store as store_module
+from labseq.calibration.quality import use_if_not_worse
 from labseq.calibration_store import Damaged, Store, Stored
 from labseq.errors import ConfigError
 from labseq.model import CalibrationEntry, SiteGrid
@@ -91,10 +92,10 @@ def test_what_is_in_use_is_known_and_so_is_what_was(store: Store) -> None:
     assert in_use.path == old.path
 
 
-def test_one_of_another_grid_is_refused_even_by_force(store: Store) -> None:
+def test_one_of_another_grid_is_refused(store: Store) -> None:
     stored = store.add(overlay())
     with pytest.raises(ConfigError, match=r"another grid: 3 x 4 sites, .*; expected 3 x 5 sites, .*, as in"):
-        store.use(stored, SiteGrid(3, 5), force=True)
+        store.use(stored, SiteGrid(3, 5))
 
 
 def test_a_damaged_file_is_listed_and_refused(store: Store) -> None:
@@ -106,7 +107,7 @@ def test_a_damaged_file_is_listed_and_refused(store: Store) -> None:
     for use in (lambda: store.find(bad.entry.id), lambda: store.entry_in_use("overlay")):
         with pytest.raises(ConfigError, match="this file is damaged: it is not a JSON object"):
             use()
-    store.use(good, GRID)  # anything is better than what cannot be read
+    use_if_not_worse(store, good, GRID)  # anything is better than what cannot be read
 
 
 def test_a_renamed_or_exchanged_file_is_refused(store: Store) -> None:

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from labseq.calibration_store import DECIDING
+from labseq.calibration.quality import DECIDING
 from labseq.errors import ConfigError, Problem
 from labseq.model import CalibrationEntry, CalibrationKind
 from labseq.recording.schema import unit_of

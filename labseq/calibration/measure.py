@@ -26,6 +26,7 @@ from labseq.calibration.methods import (
     analyse_tweezers,
     read_site_file,
 )
+from labseq.calibration.quality import why_worse_than_in_use
 from labseq.calibration.thresholds import analyse_thresholds
 from labseq.calibration_store import Store, Stored, grid_text
 from labseq.config.addresses import Override, split_overrides
@@ -136,9 +137,10 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
     store = store_of(document, spec, request.dry_run)
     before, (picture, warnings) = _in_use(store, entry), _picture(result)
     stored = store.add(entry, picture)
-    refused = "" if request.force else why_left_out(entry, hardware.calibrations) or store.why_worse(entry)
+    refused = why_left_out(entry, hardware.calibrations) or why_worse_than_in_use(store, entry)
+    refused = "" if request.force else refused
     if not refused:
-        store.use(stored, hardware.grid, force=True)  # compared above
+        store.use(stored, hardware.grid)
         overlay = store.active().get("overlay")
         if entry.kind == "frequencies" and overlay is not None:
             store.use_none("overlay")  # or its correction would be made twice

@@ -17,6 +17,7 @@ from labseq.assembly.calibrations import open_store
 from labseq.assembly.options import DryRun
 from labseq.calibration.compare import Difference, compare, quality_text, quantity
 from labseq.calibration.measure import METHODS, CalibrationRequest, Outcome, calibrate
+from labseq.calibration.quality import use_if_not_worse
 from labseq.calibration_store import Damaged, Store, Stored, age_s, grid_text
 from labseq.config.profile import OFF, CalibrationChoices
 from labseq.console.errors import lines_of
@@ -178,7 +179,10 @@ def use_calibration(choice: str, profile: str, dry_run: DryRun, *, force: bool) 
     else:
         stored = store.find(choice)
         kind = stored.entry.kind
-        store.use(stored, spec.grid_model(), force=force)
+        if force:
+            store.use(stored, spec.grid_model())
+        else:
+            use_if_not_worse(store, stored, spec.grid_model())
         say(f"{kind} {stored.entry.id} is in use from the next run on")
     if pin := spec.calibrations.use.of(kind):
         say(f"warning: the profile has 'calibrations.use.{kind}: {clean(pin)}', which takes precedence")

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from labseq.assembly.calibrations import DRY_RUN_FOLDER, FOLDER
-from labseq.calibration_store import DECIDING, Damaged, Store, Stored, figure_of
+from labseq.calibration.quality import DECIDING, figure_of
+from labseq.calibration_store import Damaged, Store, Stored
 from labseq.errors import ConfigError, LabseqError, RecordingError
 from labseq.files import PROFILES, packaged_profiles_dir, profile_dir, read_file
 from labseq.queue.listing import NIGHT, EntryRow, expected_ends, rule_texts

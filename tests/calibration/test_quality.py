@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from labseq.calibration_store import DECIDING, why_worse
+from labseq.calibration.quality import DECIDING, why_worse
 from labseq.model import CALIBRATION_KINDS, CalibrationEntry, CalibrationKind, SiteGrid
 from labseq.testing.fakes import fake_calibration
 
