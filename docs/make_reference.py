@@ -255,10 +255,10 @@ def _branch(found: type[LabseqError], indent: str) -> Iterator[str]:
 
 def attributes() -> list[Block]:
     """A row per attribute: those of every dataset first."""
-    from labseq.recording import schema
+    from labseq.recording import contents
 
-    rows = [("every dataset", f"`{name}`", "text", about) for name, about in schema.EVERYWHERE.items()]
-    for path, found in schema.attributes().items():
+    rows = [("every dataset", f"`{name}`", "text", about) for name, about in contents.EVERYWHERE.items()]
+    for path, found in contents.attributes().items():
         rows += [(f"`{path}`", f"`{name}`", kind, about) for name, (kind, about) in found.items()]
     return [Table(("of", "attribute", "type", "description"), rows)]
 

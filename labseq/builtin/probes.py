@@ -12,7 +12,7 @@ from pydantic import Field
 
 from labseq.builtin.overlay import FastOffset, SurvivalShape, fast_offset, group_counts
 from labseq.builtin.rearrange import play
-from labseq.detection.sites import measure_shift
+from labseq.detection.drift import measure_shift
 from labseq.motion.hold import cross_offsets_m, hold_program, hold_time_s
 from labseq.plugin import (
     ConfigError,

@@ -8,13 +8,37 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.detection.sites import spot_light
-
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 HOT: Final = 6.0
 """A pixel this many times brighter than its second brightest neighbour is hot; spots of 0.45 px are not."""
+
+
+def spot_light(
+    centres_px: NDArray[np.float64], corners: NDArray[np.int64], region: int, width_px: float
+) -> NDArray[np.float64]:
+    """Fraction of the light of Gaussian spots on the pixels of squares.
+
+    Args:
+        centres_px: float64 (n, 2), (y, x) of each spot.
+        corners: int64 (n, 2), (y, x) of the first pixel of each square.
+        region: Width of the squares, in pixels.
+        width_px: Width of the spots (1 sigma), in pixels.
+
+    Returns:
+        float64 (n, region, region).
+
+    Example:
+        >>> import numpy as np
+        >>> spot_light(np.array([[3.0, 3.0]]), np.array([[2, 2]]), 3, 0.1).round(3)[0, 1]
+        array([0., 1., 0.])
+    """
+    from scipy.special import ndtr
+
+    edges = (corners[:, :, None] + np.arange(region + 1) - 0.5 - centres_px[:, :, None]) / width_px
+    along_y, along_x = np.diff(ndtr(edges), axis=2).transpose(1, 0, 2)
+    return along_y[:, :, None] * along_x[:, None, :]
 
 
 def flattened(image: NDArray[Any], n_sites: int) -> Floats:

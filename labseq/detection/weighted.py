@@ -15,9 +15,8 @@ from labseq.detection.sites import (
     SiteSettings,
     Thresholds,
     checked_image,
-    pairs_within,
-    spot_light,
 )
+from labseq.detection.spots import spot_light
 from labseq.detection.threshold import ComparingDetector
 from labseq.model import Frame
 from labseq.roles import Context
@@ -315,3 +314,22 @@ def _log_normal(distance: Floats, width: float) -> Floats:
 def _log_sum(log_terms: Floats, axis: int) -> Floats:
     highest = log_terms.max(axis=axis)
     return highest + np.log(np.exp(log_terms - highest).sum(axis=axis))
+
+
+def pairs_within(positions: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
+    """Ordered pairs of different points within a distance, int64 (n_pairs, 2), sorted by the first.
+
+    Args:
+        positions: float64 (n, 2).
+        distance: In the same unit.
+
+    Example:
+        >>> import numpy as np
+        >>> pairs_within(np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 3.0]]), 1.5).tolist()
+        [[0, 1], [1, 0]]
+    """
+    from scipy.spatial import KDTree
+
+    pairs = KDTree(positions).query_pairs(distance, output_type="ndarray").astype(np.int64)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    return both[np.lexsort((both[:, 1], both[:, 0]))]

@@ -313,10 +313,11 @@ _TYPES: Final = {"i2": "int16", "i4": "int32", "f8": "float64", "?": "bool"}
 
 def datasets() -> list[Block]:
     """A row per dataset of a shot's file."""
-    from labseq.recording import schema
+    from labseq.recording.contents import datasets_of_file
 
     rows = [
-        (f"`/entry/{one.path}`", one.dtype, one.axes, one.units, one.description) for one in schema.datasets()
+        (f"`/entry/{one.path}`", one.dtype, one.axes, one.units, one.description)
+        for one in datasets_of_file()
     ]
     return [Table(("path", "type", "axes", "unit", "description"), rows)]
 

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from labseq.builtin.spot_powers import SpotPowers
-from labseq.detection.sites import site_pixels, spot_light
+from labseq.detection.sites import site_pixels
+from labseq.detection.spots import spot_light
 from labseq.errors import DeviceError
 from labseq.model import Frame, SiteGrid
 

@@ -16,7 +16,8 @@ import labseq
 from labseq.builtin.equalise import factors
 from labseq.calibration.measure import METHODS, CalibrationRequest, calibrate
 from labseq.config.profile import load_profile
-from labseq.detection.sites import known_sites, region_corners, spot_light
+from labseq.detection.sites import known_sites, region_corners
+from labseq.detection.spots import spot_light
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.model import CalibrationEntry
 from labseq.motion import correct_overlay

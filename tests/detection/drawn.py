@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from labseq.detection.sites import spot_light
+from labseq.detection.spots import spot_light
 from labseq.model import SiteGrid
 
 Floats = NDArray[np.float64]

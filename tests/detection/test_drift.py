@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from labseq.detection.sites import Shift, measure_shift
+from labseq.detection.drift import Shift, measure_shift
 from labseq.model import SiteGrid
 
 from .drawn import drawn, seen_sites

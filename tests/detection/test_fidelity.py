@@ -19,7 +19,8 @@ from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from labseq.detection.sites import known_sites, region_corners, spot_light
+from labseq.detection.sites import known_sites, region_corners
+from labseq.detection.spots import spot_light
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
 from labseq.detection.weighted import WeightedDetector, WeightedSettings
 from labseq.plugin import Context, DepthRamp, Frame, RandomStream, SiteGrid

@@ -13,8 +13,8 @@ from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
 
+from labseq.detection.drift import measure_shift
 from labseq.detection.lattice import find_lattice
-from labseq.detection.sites import measure_shift
 from labseq.plugin import Context, DepthRamp, RandomStream, SiteGrid
 
 from .drawn import drawn, seen_sites

@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 
 from labseq.detection.sites import (
     known_sites,
-    pairs_within,
     read_sites,
     region_corners,
     site_pixels,
-    spot_light,
 )
+from labseq.detection.spots import spot_light
 from labseq.detection.threshold import ThresholdDetector, ThresholdSettings
-from labseq.detection.weighted import WeightedDetector, WeightedSettings
+from labseq.detection.weighted import WeightedDetector, WeightedSettings, pairs_within
 from labseq.errors import ConfigError, DeviceError, LimitError
 from labseq.model import CalibrationEntry, Frame, SiteGrid
 from labseq.roles import Context, ReportsSignals

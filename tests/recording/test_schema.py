@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from labseq.recording import schema
+from labseq.recording import contents, schema
 from labseq.recording.shot_file import ShotEncoder
 
 from .records import make_run, make_shot
@@ -39,7 +39,7 @@ def test_the_file_holds_the_datasets_of_the_schema_with_type_unit_and_descriptio
     file.visititems(
         lambda name, node: found.update({f"/{name}": node} if isinstance(node, h5py.Dataset) else {})
     )
-    known = {f"/entry/{one.path}": one for one in schema.datasets()}
+    known = {f"/entry/{one.path}": one for one in contents.datasets_of_file()}
     assert {in_schema(name) for name in found} == {*known}
     for name, dataset in found.items():
         what = known[in_schema(name)]
@@ -89,5 +89,5 @@ def test_the_file_holds_the_attributes_of_the_schema(file: Any) -> None:
     every: dict[str, Any] = {"/": file}
     file.visititems(lambda name, node: every.update({f"/{name}": node}))
     for name, node in every.items():
-        own = {*node.attrs} - ({*schema.EVERYWHERE} if isinstance(node, h5py.Dataset) else set[str]())
-        assert own == {*schema.attributes().get(in_schema(name), {})}, name
+        own = {*node.attrs} - ({*contents.EVERYWHERE} if isinstance(node, h5py.Dataset) else set[str]())
+        assert own == {*contents.attributes().get(in_schema(name), {})}, name
