@@ -74,10 +74,10 @@ def positions(bench: Bench) -> dict[str, Any]:
     frames = bench.silence(max(16 << 20, 8 * buffer_bytes))
     transfer = bench.transfer(frames, PAGE, buffer_bytes)
     free = {"after_def_transfer": transfer.user_bytes}
-    transfer.start_dma()
-    free["after_startdma"] = transfer.user_bytes
     one_s = bench.timed(lambda: transfer.hand_over(PAGE))
     free["after_hand_over"] = transfer.user_bytes
+    transfer.start_dma()
+    free["after_startdma"] = transfer.user_bytes
     transfer.settled()
     free["after_fetching"] = transfer.user_bytes
     rest = frames.nbytes - PAGE
@@ -125,7 +125,9 @@ def _report_lags(bench: Bench) -> list[float]:
     The transfer itself is known from what eight pages take longer than one.
     """
     transfer = bench.transfer(bench.silence(16 << 20), PAGE, 16 << 20)
+    transfer.hand_over(PAGE)
     transfer.start_dma()
+    transfer.settled()
 
     def reported_s(n_pages: int) -> float:
         transfer.hand_over(n_pages * PAGE)
