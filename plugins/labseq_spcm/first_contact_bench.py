@@ -18,7 +18,7 @@ from labseq_spcm import limits
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.library import Library
 from labseq_spcm.models import ANY
-from labseq_spcm.set_up import check_type, set_up, switch_output, versions
+from labseq_spcm.set_up import check_type, identity, set_up, switch_output
 from labseq_spcm.settings import SpcmSettings
 
 LOWEST_MV: Final = ANY.amplitude_mv[0]
@@ -65,13 +65,7 @@ class Bench:
             except BaseException:
                 self.close()
                 raise
-        card, software = self.card, versions(self.card)
-        return {
-            "serial": str(card.serial_number),
-            "model": card.product,
-            "driver": software["driver"][0],
-            "firmware": software["main control firmware"][0],
-        }
+        return identity(self.card)
 
     def emergency(self, script: Path) -> Emergency | None:
         """A script that another process can run on the card; None for one that dies with this process."""
@@ -259,8 +253,8 @@ class Transfer:
 
     Attributes:
         handed: Bytes handed over so far.
-        is_new_free: Whether a new buffer counts as free for the user. By the manual it counts as full: what is
-            free is then what was fetched, until the whole buffer has been handed over.
+        is_new_free: Whether a new buffer counts as free for the user. By the manual it counts as full: what
+            is free is then what was fetched, until the whole buffer has been handed over.
     """
 
     is_new_free = False

@@ -22,7 +22,6 @@ from labseq.plugin import (
     DeviceTimeoutError,
     Emergency,
     LabseqError,
-    LimitError,
     MobileTweezers,
     ToneProgram,
     TransientError,
@@ -30,15 +29,24 @@ from labseq.plugin import (
 )
 from labseq.plugin.lines import trigger_line
 from labseq.plugin.motion import check_tone_program
-from labseq.plugin.rendering import comb_sample_rate, warm_rendering
+from labseq.plugin.rendering import warm_rendering
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard, Buffer
+from labseq_spcm.certificate import check_certificate, permitted
 from labseq_spcm.keep_warm import keep_warm_tones
 from labseq_spcm.library import choose_library, load_spcm
 from labseq_spcm.play_mode import PlayMode
 from labseq_spcm.play_sequence import SequenceReplay
 from labseq_spcm.replay_fifo import Fifo, Replay
-from labseq_spcm.set_up import check_type, close_relays, set_amplitude, set_up, switch_output, versions
+from labseq_spcm.set_up import (
+    check_type,
+    close_relays,
+    identity,
+    set_amplitude,
+    set_up,
+    switch_output,
+    versions,
+)
 from labseq_spcm.settings import NO_TRIGGER, SpcmSettings
 from labseq_spcm.stream import Stream, check_rendering
 
@@ -81,7 +89,8 @@ class SpcmMobileTweezers(MobileTweezers):
             if settings.mode == "stream":
                 raise ConfigError(f"{self._name}: a line triggers it, but mode: stream {NO_TRIGGER}")
             settings = settings.model_copy(update={"trigger": "external"})
-        self._settings = settings
+        self._settings, self._uncertified = permitted(settings)
+        settings = self._settings
         self._context = context
         self._clock = context.clock
         self._rf = context.motion.rf
@@ -132,23 +141,16 @@ class SpcmMobileTweezers(MobileTweezers):
         return math.inf if self._mode is None else self._mode.beginning_s
 
     def warnings(self) -> list[str]:
-        """A rate that does not suit the reference clock, or of which another is rendered much faster."""
+        """A stream without a certificate, rates that do not suit the reference clock or render slowly."""
         settings, grid = self._settings, self._context.grid
-        found = limits.reference_warnings(self._name, settings.sample_rate, settings.reference_clock, grid)
-        return found + self._rendering_warnings()
-
-    def _rendering_warnings(self) -> list[str]:
-        rate_hz = self._settings.sample_rate
-        try:
-            best_hz = comb_sample_rate(self._context.grid, rate_hz)
-        except LimitError:
-            best_hz = rate_hz
-        if best_hz == rate_hz:
-            return []
-        rate, best = (format_quantity(hz, "frequency") for hz in (rate_hz, best_hz))
-        what = f"profile.{self._name}.sample_rate is {rate}; its samples take up to three times as long"
-        why = f"to render as those at {best}, a whole number per tone spacing"
-        return [f"{what} {why}; set sample_rate: {best}"]
+        rate = self._name, settings.sample_rate
+        found = limits.reference_warnings(*rate, settings.reference_clock, grid)
+        found = found or limits.rendering_warnings(*rate, grid)
+        if self._uncertified:
+            what = f"profile.{self._name}.mode is stream, which needs the certificate of a first contact, and"
+            why = f"{self._uncertified}; mode: {settings.mode} is used instead"
+            found.append(f"{what} {why} until 'labseq first-contact' has made one")
+        return found
 
     def warm(self) -> None:
         """Import the vendor's package, and compile the kernels of the mode or load them from the cache.
@@ -177,6 +179,7 @@ class SpcmMobileTweezers(MobileTweezers):
                 is of another type, or it does not take a setting; or the bus or this computer is too
                 slow for the mode ``stream``.
             LimitError: This card cannot do the profile's ``rf.full_scale``.
+            ConfigError: The certificate of the mode ``stream`` is of another card, driver or firmware.
         """
         if self._card is not None:
             return
@@ -184,6 +187,8 @@ class SpcmMobileTweezers(MobileTweezers):
         try:
             self._model = check_type(card, self._settings)
             limits.full_scale_mv(self._name, self._rf, self._model)
+            if self._settings.mode == "stream":
+                check_certificate(self._settings, identity(card))
             card.n_outputs, card.outputs = self._model.n_outputs, tuple(sorted(self._settings.outputs))
             self._facts = set_up(card, self._settings, self._amplitude_mv)
             self._mode = self._new_mode(card)
@@ -435,6 +440,8 @@ class SpcmMobileTweezers(MobileTweezers):
         if isinstance(self._mode, Stream | SequenceReplay):
             facts["delayed_batches"] = self._mode.n_pauses
         settings = self._settings.model_dump(mode="json")
+        if self._uncertified:
+            facts["not_streamed_because"] = self._uncertified
         return {**settings, "model": self._model.name, **facts}
 
     def _opened(self) -> tuple[AwgCard, PlayMode]:

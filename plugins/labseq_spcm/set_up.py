@@ -103,6 +103,17 @@ def set_up(card: AwgCard, settings: SpcmSettings, amplitude_mv: int) -> dict[str
     }
 
 
+def identity(card: AwgCard) -> dict[str, str]:
+    """What a first contact is valid for: serial number, model, driver and firmware."""
+    software = versions(card)
+    return {
+        "serial": str(card.serial_number),
+        "model": card.product,
+        "driver": software["driver"][0],
+        "firmware": software["main control firmware"][0],
+    }
+
+
 def versions(card: AwgCard) -> dict[str, tuple[str, str]]:
     """Versions of the vendor's software and of the firmware: installed, tested; no real card was tested."""
     spcm = card.spcm

@@ -68,7 +68,9 @@ that waits to be rendered and one that was, and which: the arguments of RENDER."
 (IS_FILLING, TO_START, START_COMMAND, NOW_NS, FILLED_BY_NS) = range(41, 46)
 """Whether the card is filled before its start, the samples that it must have fetched then, the M2CMD, the
 time of this step, and when the filling must be over."""
-N_WORDS: Final = 48
+(STARTED_NS, SHIFT, WINDOW_NS, LEAST_LAG, USUAL_LAG, BY_CLOCK) = range(48, 54)
+"""When the card was started, what else :func:`follow_clock` remembers, and its result."""
+N_WORDS: Final = 54
 
 LENGTH, ROW_CHANNEL, CUTS, N_CUTS, READY_MADE, ROOM, AXES, N_AXIS, BASE, N_READY, BEGAN = range(11)
 """Words of a program: samples in whole blocks, output of the row axis, address and number of the samples
@@ -77,6 +79,13 @@ address of :meth:`Renderer.words`, and words of an axis. The loop writes the fir
 samples, their number, and where in the stream the program begins."""
 N_PROGRAM: Final = 11
 
+FOLLOWED_NS: Final = 100_000_000
+"""How long the least lag is taken for the drift of the clocks against one another."""
+DRIFT: Final = 20e-6
+"""How much slower the card's clock may be than the computer's; the manual gives 5 ppm for the card's."""
+UNKNOWN: Final = 1 << 62
+FILLED_NS: Final = 2_000_000
+"""From then on after the start the card's buffers are full; before it holds less than the clock says."""
 SURE: Final = 4
 """A piece is surely in time if so many times its length is ahead."""
 CHUNK: Final = 1 << 15
@@ -280,11 +289,43 @@ def render_ahead(box: Words, program: Words, until: int) -> bool:
     return True
 
 
+@helper_kernel("void(int64[::1], int64)")
+def follow_clock(box: Words, rate_hz: int) -> None:
+    """Work out how many samples the card has fetched at most by the clock, in whole blocks: BY_CLOCK.
+
+    It plays since its start and holds no more than its buffers do. The report lags behind that by a part of a
+    block, and by the time of an interrupt. How much the lag changes from one tenth of a second to the next is
+    the drift of the clocks: a card that gains is followed at once, one that loses only as fast as clocks may
+    differ, because its reports may also have become later.
+    """
+    played = 1e-9 * (box[NOW_NS] - box[STARTED_NS]) * rate_hz
+    lag = int(played) + box[ON_CARD] + box[SHIFT] - box[FETCHED]
+    box[LEAST_LAG] = min(box[LEAST_LAG], lag)
+    if box[NOW_NS] >= box[WINDOW_NS]:
+        if box[USUAL_LAG] == UNKNOWN:
+            box[USUAL_LAG] = box[LEAST_LAG]
+        slower = int(DRIFT * 1e-9 * (box[NOW_NS] - box[WINDOW_NS] + FOLLOWED_NS) * rate_hz)
+        shift = min(box[LEAST_LAG] - box[USUAL_LAG], slower)
+        box[SHIFT] -= shift
+        lag -= shift
+        box[LEAST_LAG], box[WINDOW_NS] = UNKNOWN, box[NOW_NS] + FOLLOWED_NS
+    box[BY_CLOCK] = -(-(box[FETCHED] + lag) // box[BLOCK]) * box[BLOCK]
+
+
+@helper_kernel("int64(int64[::1])")
+def earliest(box: Words) -> int:
+    """Where a program may begin at the earliest."""
+    start = box[FETCHED] + box[AHEAD]
+    if box[NOW_NS] - box[STARTED_NS] < FILLED_NS:
+        start = max(start, box[BY_CLOCK] + box[BLOCK])
+    return start  # pyright: ignore[reportReturnType]
+
+
 @helper_kernel("void(int64[::1])")
 def take_program(box: Words) -> None:
     """Make the next program the present one; it begins where the last one ends, or as soon as it can."""
     program = carray(pointer(box[QUEUE + box[TAKEN] % N_QUEUE]), N_PROGRAM, np.int64)
-    start = max(box[END], box[FETCHED] + box[AHEAD])
+    start = max(box[END], earliest(box))
     box[END] = start + program[LENGTH]
     box[START] = box[MADE] = start
     box[PREPARED] = box[UNTIL] = 0
@@ -309,7 +350,7 @@ def begin_piece(box: Words) -> int:
     if box[MADE] - box[FETCHED] < box[AHEAD] + SURE * (until - done) and render_ahead(box, program, until):
         is_low = 2 * (box[WRITTEN] - box[FETCHED]) < box[N_RING]
         return supply_silence(box, MOST_SAMPLES) if is_low else 0  # a little, as copying takes time
-    late = box[FETCHED] + box[AHEAD] + max(0, box[SLOW] - box[BLOCK]) - box[MADE]
+    late = earliest(box) + max(0, box[SLOW] - box[BLOCK]) - box[MADE]
     if late > 0:
         late = -(-late // box[BLOCK]) * box[BLOCK]
         if supply_silence(box, box[MADE] + late + box[BLOCK] - box[WRITTEN]):
@@ -328,11 +369,12 @@ def begin_piece(box: Words) -> int:
 def is_in_time(box: Words) -> bool:
     """Whether the last part was written before the card fetched it.
 
-    The card reports whole blocks, so it may have fetched one more.
+    The card reports whole blocks, so it may have fetched one more; and as much as the clock says, if its
+    report is later than a block.
     """
     if box[PART] < 0:
         return True
-    left = box[PART] - box[FETCHED] - box[BLOCK]
+    left = box[PART] - max(box[FETCHED] + box[BLOCK], box[BY_CLOCK])
     box[LEAST], box[PART] = min(box[LEAST], left), -1
     return left >= 0  # pyright: ignore[reportReturnType]
 
@@ -344,7 +386,9 @@ def start_when_filled(box: Words) -> int:
         if box[FILLED_BY_NS] == 0:
             box[FILLED_BY_NS] = box[NOW_NS] + FILLING_NS
         return STUCK if box[NOW_NS] > box[FILLED_BY_NS] else FILLING_POLL_NS
-    box[IS_FILLING] = box[FILLED_BY_NS] = 0
+    box[IS_FILLING] = box[FILLED_BY_NS] = box[SHIFT] = 0
+    box[STARTED_NS], box[WINDOW_NS] = box[NOW_NS], box[NOW_NS] + FOLLOWED_NS
+    box[LEAST_LAG] = box[USUAL_LAG] = UNKNOWN
     return FAILED if call_library(box, box[SET], COMMAND, box[START_COMMAND]) else 0
 
 
@@ -358,6 +402,7 @@ def supply(box: Words, rate_hz: int) -> int:
         return in_ring
     if box[RENDERED_AT] >= 0:
         box[SLOW], box[RENDERED_AT] = box[FETCHED] - box[RENDERED_AT], -1
+    follow_clock(box, rate_hz)
     if not is_in_time(box):
         return LATE
     if box[MADE] >= box[END] and box[TAKEN] < box[QUEUED]:

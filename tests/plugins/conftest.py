@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm_sim import M4I6631, CardModel, SimulatedCard, installed
+from labseq_spcm_sim import M4I6631, CardModel, Faults, SimulatedCard, installed
 from numpy.typing import NDArray
 
 from labseq.motion import tone_program
@@ -110,11 +110,12 @@ def open_driver(
     model: CardModel = M4I6631,
     clock: FakeClock | None = None,
     named: str = "",
+    card_faults: Faults = Faults(),  # noqa: B008 - frozen
     **settings: Any,
 ) -> Generator[Lab]:
     """Within the block the driver is open on a simulated card; ``named`` is its model in the settings."""
     clock = clock or FakeClock()
-    card = SimulatedCard(clock, model=model)
+    card = SimulatedCard(clock, model=model, faults=card_faults)
     motion = motion or MotionSpec()
     with installed(card) as name:
         given = {"card": name, "mode": mode, "sample_rate": RATE_HZ, "model": named, **settings}

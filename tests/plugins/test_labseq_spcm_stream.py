@@ -16,7 +16,7 @@ from labseq_spcm import stream_kernels as k
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm.stream import Stream, check_rendering, stream_program
-from labseq_spcm_sim import M4I6631, SimulatedCard, installed, registers
+from labseq_spcm_sim import M4I6631, Faults, SimulatedCard, installed, registers
 
 from labseq.motion import tone_program
 from labseq.motion.rendering import render
@@ -220,6 +220,36 @@ def test_a_computer_that_is_held_up_after_the_last_samples_were_handed_over(driv
         lab.card.hold_up(duration_s)
         lab.tweezers.wait(1.0)
         start_s(lab, program)
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 5e-3, 1.5])
+@pytest.mark.parametrize(("lag_s", "is_seen"), [(20e-6, False), (131e-6, True)])
+def test_a_position_that_is_reported_more_than_a_block_late_is_an_underrun(
+    driver: Any, lag_s: float, is_seen: bool, pause_s: float
+) -> None:
+    """Without a look at the clock the first samples were lost, and nothing said so."""
+    late = Faults(position_lag_s=lag_s)
+    with driver("stream", sample_rate=624e6, card_faults=late) as lab:
+        lab.tweezers.settle()
+        lab.clock.sleep(pause_s)
+        lab.card.forget(lab.clock.now())
+        program = lab.program(3)
+        with pytest.raises(TransientError, match="underrun") if is_seen and pause_s else nullcontext():
+            lab.play(program)
+            start_s(lab, program)
+
+
+@pytest.mark.parametrize("drift", [-18e-6, 18e-6])
+def test_a_card_whose_clock_drifts_is_followed(driver: Any, drift: float) -> None:
+    """After 6 s the clocks are four blocks apart."""
+    with driver("stream", sample_rate=624e6) as lab:
+        lab.tweezers.settle()
+        lab.card._machine.fifo._rate *= 1 + drift
+        for _ in range(12):
+            lab.clock.sleep(0.5)
+            lab.play(lab.program(1))
+        shift = lab.tweezers._mode._box[k.SHIFT]
+        assert shift == pytest.approx(drift * 6 * 624e6, rel=0.2)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 3e-3, 60e-3])
