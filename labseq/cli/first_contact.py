@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from labseq.assembly.options import DryRun
 from labseq.console.output import report_compiling, say, write_text
-from labseq.errors import ConfigError, DeviceError, one_of
+from labseq.errors import ConfigError, DeviceError, StopRequested, one_of
 from labseq.guard import StopFlag
 from labseq.kernels.kernel import announcing
 from labseq.roles.first_contact import ContactStep, Reading
@@ -129,8 +129,12 @@ def _answer(question: str, stop: StopFlag) -> str:
     lines = list[str]()
     reader = threading.Thread(target=lambda: lines.append(sys.stdin.readline()), daemon=True)
     reader.start()
-    while reader.is_alive():
-        stop.wait(0.05)
+    try:
+        while reader.is_alive():
+            stop.wait(0.05)
+    except StopRequested:
+        say("")  # the next line does not begin behind the question
+        raise
     if not lines or not lines[0]:
         raise ConfigError("there is no terminal that could answer; give --yes, and --with for instruments")
     return lines[0].strip()

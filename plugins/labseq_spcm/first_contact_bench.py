@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import time
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -18,7 +18,7 @@ from labseq_spcm import limits
 from labseq_spcm.card import AwgCard, Buffer
 from labseq_spcm.library import Library
 from labseq_spcm.models import ANY
-from labseq_spcm.set_up import check_type, identity, set_up, switch_output
+from labseq_spcm.set_up import NEXT_OUTPUT, check_type, identity, set_up, switch_output
 from labseq_spcm.settings import SpcmSettings
 
 LOWEST_MV: Final = ANY.amplitude_mv[0]
@@ -118,30 +118,33 @@ class Bench:
         """Stop, open the relays, and reset; all of it also after a step that was refused.
 
         Raises:
-            DeviceError: The card refused a step twice.
+            DeviceError: The card refused its reset, or is not off after it.
         """
         if self._borrower is not None:  # a step was interrupted while the driver had the card
             self._borrower.safe_state()
         if self._is_lent:  # a step was interrupted while another process had the card
             self.open_again()
-        card = self._card
-        if card is None:
+        if (card := self._card) is None:
             return
+        with suppress(DeviceError):
+            card.clear_error()  # perhaps of an earlier call, which has locked the library
         for step in (
             card.stop,
             *(partial(switch_output, card, output, on=False) for output in range(card.n_outputs)),
             card.write_setup,
-            lambda: card.command(card.spcm.M2CMD_CARD_RESET, "reset"),
         ):
-            try:
+            with suppress(DeviceError):  # a card whose clock has not locked refuses its set-up
                 step()
-            except DeviceError:
-                card.clear_error()  # perhaps of an earlier call, which has locked the library
-                step()
+        card.command(card.spcm.M2CMD_CARD_RESET, "reset")  # which disables the outputs in any case
+        relay = card.spcm.SPC_ENABLEOUT0
+        enabled = [output for output in range(card.n_outputs) if card.read(relay + NEXT_OUTPUT * output)]
+        if enabled or card.running:
+            raise DeviceError(self.name, f"after its reset the card runs, or its outputs {enabled} are on")
 
     def fresh(self) -> AwgCard:
         """The card after a reset, set up as the driver does it, with the lowest amplitude and open relays."""
-        set_up(self.card, self.settings, LOWEST_MV)
+        own_clock = self.settings.model_copy(update={"reference_clock": None})  # one step tries the reference
+        set_up(self.card, own_clock, LOWEST_MV)
         return self.card
 
     # Time
@@ -179,6 +182,23 @@ class Bench:
                 raise DeviceTimeoutError(self.name, f"{what}: nothing within {limit_s:g} s", limit_s)
             self.look_again(poll_s)
         return self.now() - start_s
+
+    def last_missed(self, condition: Callable[[], bool], limit_s: float, what: str) -> float:
+        """Wait for a condition; returns after which time it was certainly not met yet, in seconds.
+
+        The look that finds it met may come much later, because the computer was busy with something else.
+        """
+        missed_s, start_s = list[float](), self.now()
+
+        def is_met() -> bool:
+            looked_s = self.now()
+            met = condition()
+            if not met:
+                missed_s.append(looked_s)
+            return met
+
+        self.until(is_met, limit_s, what)
+        return missed_s[-1] - start_s if missed_s else 0.0
 
     # The card
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from labseq.plugin import DeviceError
-from labseq_spcm.first_contact_bench import LOWEST_MV, Bench
+from labseq_spcm.first_contact_bench import Bench
 from labseq_spcm.limits import REFERENCE_HZ
-from labseq_spcm.set_up import close_relays, set_up, switch_output, versions
+from labseq_spcm.set_up import close_relays, switch_output, versions
 
 REGISTERS: Final = {
     "card_type": "SPC_PCITYP",
@@ -75,7 +75,7 @@ def identity(bench: Bench) -> dict[str, Any]:
     facts["has_dds"] = bool((facts["extended_features"] or 0) & spcm.SPCM_FEAT_EXTFW_DDS20)
     facts["is_remote"] = bool((facts["features"] or 0) & spcm.SPCM_FEAT_NETBOX)
     facts["versions"] = {name: found for name, (found, _) in versions(bench.card).items()}
-    facts["rate_read_back_hz"] = set_up(bench.card, bench.settings, LOWEST_MV)["sample_rate_hz"]
+    facts["rate_read_back_hz"] = bench.fresh().read(spcm.SPC_SAMPLERATE)
     return facts
 
 
@@ -172,7 +172,8 @@ def reference(bench: Bench) -> dict[str, Any]:
     card.set(spcm.SPC_CLOCKMODE, spcm.SPC_CM_EXTREFCLOCK, "clock mode")
     card.set(spcm.SPC_REFERENCECLOCK, round(REFERENCE_HZ[0]), "reference clock in Hz")
     highest_hz = card.read(spcm.SPC_MIINST_MAXADCLOCK)
-    made = [_made_from_reference(bench, round(hz)) for hz in RATES_HZ if hz <= highest_hz]
+    rates_hz = sorted({*RATES_HZ, bench.settings.sample_rate})
+    made = [_made_from_reference(bench, round(hz)) for hz in rates_hz if hz <= highest_hz]
     return {"rates": made, "locks": any(actual_hz for _, actual_hz, _ in made)}
 
 

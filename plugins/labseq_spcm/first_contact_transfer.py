@@ -45,12 +45,12 @@ def write_speed(bench: Bench) -> dict[str, Any]:
 
 
 def _speed(bench: Bench, frames: NDArray[np.int16], notify_bytes: int) -> float:
-    """Speed from two amounts, so that what each transfer takes anyway drops out; the fastest of three."""
+    """Speed from two amounts, so that what each transfer takes anyway drops out; the fastest of five."""
     large = frames.nbytes // notify_bytes * notify_bytes
     small = max(notify_bytes, large // 5 // notify_bytes * notify_bytes)
     if large <= small:
         return 0.0
-    took_s = [min(_write_s(bench, frames, notify_bytes, n) for _ in range(3)) for n in (small, large)]
+    took_s = [min(_write_s(bench, frames, notify_bytes, n) for _ in range(5)) for n in (small, large)]
     return (large - small) / max(1e-9, took_s[1] - took_s[0])
 
 
@@ -74,10 +74,10 @@ def positions(bench: Bench) -> dict[str, Any]:
     frames = bench.silence(max(16 << 20, 8 * buffer_bytes))
     transfer = bench.transfer(frames, PAGE, buffer_bytes)
     free = {"after_def_transfer": transfer.user_bytes}
-    transfer.start_dma()
-    free["after_startdma"] = transfer.user_bytes
     one_s = bench.timed(lambda: transfer.hand_over(PAGE))
     free["after_hand_over"] = transfer.user_bytes
+    transfer.start_dma()
+    free["after_startdma"] = transfer.user_bytes
     transfer.settled()
     free["after_fetching"] = transfer.user_bytes
     rest = frames.nbytes - PAGE
@@ -96,14 +96,17 @@ def positions(bench: Bench) -> dict[str, Any]:
 def lag(bench: Bench) -> dict[str, Any]:
     """How late the card reports what it has fetched: at rest, beside a busy computer, and while it plays.
 
+    Each figure is the time of the last look that did not show the report yet: a computer that is busy with
+    something else makes it smaller, not larger.
+
     Returns:
         Seconds: medians and worst cases; "playing_spread_s" is the variation of the report while the card
         plays, "rate_error" the relative difference of its clock from the computer's.
     """
     idle_s = _report_lags(bench)
+    spread_s, rate_error = _playing(bench)
     with _busy_computer():
         busy_s = _report_lags(bench)
-        spread_s, rate_error = _playing(bench)
     worst_s = max(*idle_s, *busy_s)
     return {
         "idle_median_s": statistics.median(idle_s),
@@ -122,12 +125,15 @@ def _report_lags(bench: Bench) -> list[float]:
     The transfer itself is known from what eight pages take longer than one.
     """
     transfer = bench.transfer(bench.silence(16 << 20), PAGE, 16 << 20)
+    transfer.hand_over(PAGE)
     transfer.start_dma()
+    transfer.settled()
 
     def reported_s(n_pages: int) -> float:
         transfer.hand_over(n_pages * PAGE)
         expected = transfer.handed
-        return bench.until(lambda: transfer.reported >= expected, 1.0, "the report of a fetched page")
+        report = "the report of a fetched page"
+        return bench.last_missed(lambda: transfer.reported >= expected, 1.0, report)
 
     one_s, eight_s = ([reported_s(n) for _ in range(N_LAGS)] for n in (1, 8))
     bench.card.stop()
@@ -144,23 +150,26 @@ def _playing(bench: Bench) -> tuple[float, float]:
     transfer.settled()
     transfer.play()
     rate = bench.card.read(bench.card.spcm.SPC_SAMPLERATE) * FRAME_BYTES
-    start_s, seen = bench.now(), list[tuple[float, int]]()
+    start_s = missed_s = bench.now()
+    seen, last = list[tuple[float, float]](), transfer.reported
     while (now_s := bench.now()) - start_s < FOLLOWED_S:
-        user_bytes = transfer.user_bytes
+        user_bytes, looked_s = transfer.user_bytes, bench.now()
         count = transfer.fetched(user_bytes)
         transfer.feed(user_bytes)
-        if not seen or count != seen[-1][1]:
-            seen.append((now_s, count))
+        if count != last:  # the next block was not reported at the look before, and this one is now
+            seen.append((missed_s - (last + block) / rate, looked_s - count / rate))
+        missed_s, last = now_s, count
         bench.look_again(5e-6)
     bench.card.stop()
-    if len(seen) < 8:
-        raise DeviceError(
-            bench.name, f"the card reported {len(seen)} positions while it played {FOLLOWED_S:g} s"
-        )
-    times_s, counts = np.array(seen[len(seen) // 8 :]).T  # the first blocks fill the FIFO behind the memory
-    slope, _ = np.polyfit(times_s - times_s[0], counts - counts[0], 1)
-    late_s = times_s - counts / slope
-    return float(np.ptp(late_s)), float(slope / rate - 1.0)
+    if len(seen) < 16:
+        text = f"the card reported {len(seen)} positions while it played for {FOLLOWED_S:g} s"
+        raise DeviceError(bench.name, text)
+    at_least_s, at_most_s = np.array(
+        seen[len(seen) // 8 :]
+    ).T  # the first blocks fill the FIFO behind the memory
+    early, late = np.array_split(at_most_s, 2)
+    drift = (late.min() - early.min()) / (FOLLOWED_S / 2)
+    return max(0.0, float(at_least_s.max() - at_most_s.min())), float(-drift)
 
 
 @contextmanager

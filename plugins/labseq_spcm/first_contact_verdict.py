@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final, TypeAlias
 
 from labseq.plugin import format_quantity
-from labseq_spcm.limits import FRAME_BYTES
+from labseq_spcm.limits import FRAME_BYTES, RATE_STEP_HZ
 from labseq_spcm.settings import SpcmSettings
 
 Result: TypeAlias = Mapping[str, Any]
@@ -74,9 +74,9 @@ def _bursts(result: Result, _settings: SpcmSettings) -> str:
     seen, shortest_s, whole_s = result.get("bursts"), result.get("shortest_s"), result["burst_s"]
     if seen is None:
         return "nobody has seen whether written-over samples reach the output"
-    if seen < result["written"]:
-        return f"{seen:g} of {result['written']} bursts that were written over silence reached the output"
-    is_cut = shortest_s is not None and shortest_s < 0.9 * whole_s
+    if seen < result["in_time"] or not result["in_time"]:
+        return f"{seen:g} of {result['in_time']} bursts that were written over silence reached the output"
+    is_cut = seen == result["in_time"] and shortest_s is not None and shortest_s < 0.9 * whole_s
     return "bursts that were written over silence lost their beginning" if is_cut else ""
 
 
@@ -108,6 +108,17 @@ def _trigger(result: Result, _settings: SpcmSettings) -> str:
     return text if differs_s > DELAY_TOLERANCE_S else ""
 
 
+def _reference(result: Result, settings: SpcmSettings) -> str:
+    if settings.reference_clock is None:
+        return ""
+    if not result["locks"]:
+        return "the card's clock does not lock on the external reference"
+    made_hz = {asked_hz: actual_hz for asked_hz, actual_hz, _ in result["rates"]}[round(settings.sample_rate)]
+    wanted, made = (format_quantity(hz, "frequency") for hz in (settings.sample_rate, made_hz))
+    text = f"the card makes {made} from the external reference, and not the sample_rate, {wanted}"
+    return text if abs(made_hz - settings.sample_rate) > RATE_STEP_HZ else ""
+
+
 def _warm(result: Result, _settings: SpcmSettings) -> str:
     sensors = [result[name] for name in ("base_card_c", "front_end_c") if result[name] is not None]
     hottest_c = max(sensors, default=0)
@@ -133,6 +144,7 @@ ALL_MODES: Final[tuple[tuple[str, Claim], ...]] = (
     ("second_process", _second),
     ("killed", _killed),
     ("trigger", _trigger),
+    ("reference", _reference),
 )
 """Step, and what the driver assumes in every mode; it works without."""
 

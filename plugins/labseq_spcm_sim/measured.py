@@ -88,7 +88,7 @@ def _faults(measured: Mapping[str, Mapping[str, Any]]) -> Faults:
     return Faults(
         copies_samples=hand_over_s > 0.5 / COPY_BYTES_PER_S
         if bursts is None
-        else bursts < overwritten["written"],
+        else bursts < overwritten["in_time"],
         position_lag_s=lag.get("worst_s", 0.0),
         fifo_short_bytes=max(0, room - fetched),
         pinning_s=measured.get("times", {}).get("naming_64_kib_s", 0.0),

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,15 +16,26 @@ import pytest
 from labseq_spcm.first_contact import SpcmFirstContact
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
-from labseq_spcm_sim import M4I6631, CardModel, Faults, SampleSpan, SimulatedCard, card_with, installed
+from labseq_spcm_sim import (
+    M4I6631,
+    CardModel,
+    Faults,
+    SampleSpan,
+    SimulatedCard,
+    card_with,
+    installed,
+    setup,
+)
 from labseq_spcm_sim.faults import MANUAL_SPEEDS
 
 from labseq.drivers.first_contact import write_contact
 from labseq.plugin import ConfigError, Context, DeviceError, DeviceTimeoutError
 from labseq.testing.fakes import FakeClock
 
-from .card_process import TweezersOfProcess
+from .card_process import PLUGIN, TweezersOfProcess
 from .card_process_emergency import Connection
+from .labseq_soapy_rig import until
+from .small_run import write
 
 RATE_HZ = 624e6
 BLOCK_S = 65536 / 4 / RATE_HZ
@@ -111,6 +125,37 @@ def test_write_speed_is_that_of_the_bus_also_from_the_continuous_buffer() -> Non
         speeds = lab.take("write_speed")["write_speed"]
     assert dict(speeds["user"]) == pytest.approx(dict(MANUAL_SPEEDS), rel=0.01)
     assert [speed for _, speed in speeds["continuous"]] == pytest.approx([2549e6] * 5, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("reference_hz", "named"), [(10e6, "and not the sample_rate, 624 MHz"), (0.0, "not lock")]
+)
+def test_rates_from_a_reference_are_those_that_the_card_makes(reference_hz: float, named: str) -> None:
+    model = replace(M4I6631, reference_hz=reference_hz, reference_divider=1)
+    with met(with_faults(model=model), reference_clock="10 MHz") as lab:
+        result = lab.take("reference")["reference"]
+        verdict = lab.contact.judge({"reference": result})
+    made = {asked: actual for asked, actual, _ in result["rates"]}
+    assert made[620_000_000] == (620_000_000 if reference_hz else 0)
+    assert made[624_000_000] != 624_000_000
+    assert named in verdict["reason"]
+
+
+def test_the_option_dds_is_read_where_the_card_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With figures that others read from an M4i.9622."""
+    with met() as lab:
+        spcm = lab.contact._bench.card.spcm
+        assert "no licence of the option DDS" in lab.take("dds")["dds"]["skipped"]
+        option: dict[int, Any] = {
+            spcm.SPC_PCIEXTFEATURES: spcm.SPCM_FEAT_EXTFW_DDS20,
+            spcm.SPC_DDS_NUM_CORES: 23,
+            spcm.SPC_DDS_AVAIL_FREQ_SLOPE_STEP: 2775.5,
+        }
+        monkeypatch.setitem(setup._RULES, spcm.SPC_CARDMODE, lambda _setup, value: value)
+        lab.card._identity.update(option)
+        facts = lab.take("dds")["dds"]
+    assert (facts["cores"], facts["frequency_slope_step_hz_per_s"]) == (23, 2775.5)
+    assert facts["amplitude_slope_step_per_s"] is None, "this card does not tell"
 
 
 class TestScope:
@@ -270,3 +315,31 @@ def test_another_model_and_a_card_in_use_are_refused() -> None:
         other = SpcmMobileTweezers(settings, context).first_contact()
         with pytest.raises(DeviceError, match=r"in use; .*close what else uses it"):
             other.open()
+
+
+def test_the_command_that_is_killed_while_an_output_is_on_leaves_the_card_off(
+    outliving: str, tmp_path: Path
+) -> None:
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "card.py").write_text(PLUGIN, encoding="utf-8")
+    card = f"{{use: spcm_process, card: 'simulated@{outliving}', sample_rate: {RATE_HZ / 1e6:g} MHz}}"
+    write(tmp_path, mobile=card)
+    with (tmp_path / "p.yaml").open("a", encoding="utf-8") as profile:
+        profile.write("plugin_folders: [plugins]\n")
+    step = ["--yes", "--with", "scope", "--step", "relay_steps"]
+    command = [sys.executable, "-m", "labseq", "first-contact", "./p.yaml", "mobile_tweezers", *step]
+    place = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    with subprocess.Popen(command, cwd=tmp_path, env=place, stdin=subprocess.DEVNULL) as process:
+        instrument: list[Connection] = []
+
+        def outputs_on() -> bool:
+            with suppress(OSError, ValueError):
+                instrument[:] = instrument or [Connection(outliving)]
+            return bool(instrument) and instrument[0]("state")[1] == (True, True)
+
+        until(outputs_on, 120.0)
+        process.kill()
+    until(lambda: not outputs_on())
+    assert instrument[0]("state") == (False, (False, False))
+    instrument[0].close()
+    assert not (tmp_path / "data").exists(), "nothing was measured"
