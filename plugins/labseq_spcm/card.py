@@ -258,7 +258,7 @@ class AwgCard:
     def not_fetched(self, fetched_bytes: int, expected_bytes: int) -> DeviceTimeoutError:
         """The error of a stream that cannot be started."""
         text = f"the card fetched {fetched_bytes} of {expected_bytes} bytes, and was not started"
-        hint = "use mode: replay, and see the card's bus in Spectrum's Control Center"
+        hint = "use mode: sequence, and see the card's bus in Spectrum's Control Center"
         return DeviceTimeoutError(self.name, f"{text}; {hint}", TRANSFER_TIMEOUT_S)
 
     def upload(self, frames: NDArray[np.int16], poll_s: float = POLL_S) -> float:

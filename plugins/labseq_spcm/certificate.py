@@ -21,7 +21,7 @@ def permitted(settings: SpcmSettings) -> tuple[SpcmSettings, str]:
     if not reason:
         return settings, ""
     mode = SpcmSettings.model_fields["mode"].default
-    return settings.model_copy(update={"mode": mode, "keep_warm": None}), reason
+    return settings.model_copy(update={"mode": mode}), reason
 
 
 def missing_certificate(settings: SpcmSettings) -> str:

@@ -22,7 +22,6 @@ from labseq.plugin import (
     DeviceTimeoutError,
     Emergency,
     LabseqError,
-    LimitError,
     MobileTweezers,
     ToneProgram,
     TransientError,
@@ -30,7 +29,7 @@ from labseq.plugin import (
 )
 from labseq.plugin.lines import trigger_line
 from labseq.plugin.motion import check_tone_program
-from labseq.plugin.rendering import comb_sample_rate, warm_rendering
+from labseq.plugin.rendering import warm_rendering
 from labseq_spcm import limits
 from labseq_spcm.card import POLL_S, AwgCard, Buffer
 from labseq_spcm.certificate import check_certificate, permitted
@@ -142,27 +141,16 @@ class SpcmMobileTweezers(MobileTweezers):
         return math.inf if self._mode is None else self._mode.beginning_s
 
     def warnings(self) -> list[str]:
-        """A stream without a certificate; rates that do not suit the reference clock, or render slowly."""
+        """A stream without a certificate, rates that do not suit the reference clock or render slowly."""
         settings, grid = self._settings, self._context.grid
-        found = limits.reference_warnings(self._name, settings.sample_rate, settings.reference_clock, grid)
+        rate = self._name, settings.sample_rate
+        found = limits.reference_warnings(*rate, settings.reference_clock, grid)
+        found = found or limits.rendering_warnings(*rate, grid)
         if self._uncertified:
             what = f"profile.{self._name}.mode is stream, which needs the certificate of a first contact, and"
-            why = f"{self._uncertified}; mode: {settings.mode} without keep_warm is used instead"
+            why = f"{self._uncertified}; mode: {settings.mode} is used instead"
             found.append(f"{what} {why} until 'labseq first-contact' has made one")
-        return found + self._rendering_warnings()
-
-    def _rendering_warnings(self) -> list[str]:
-        rate_hz = self._settings.sample_rate
-        try:
-            best_hz = comb_sample_rate(self._context.grid, rate_hz)
-        except LimitError:
-            best_hz = rate_hz
-        if best_hz == rate_hz:
-            return []
-        rate, best = (format_quantity(hz, "frequency") for hz in (rate_hz, best_hz))
-        what = f"profile.{self._name}.sample_rate is {rate}; its samples take up to three times as long"
-        why = f"to render as those at {best}, a whole number per tone spacing"
-        return [f"{what} {why}; set sample_rate: {best}"]
+        return found
 
     def warm(self) -> None:
         """Import the vendor's package, and compile the kernels of the mode or load them from the cache.

@@ -174,7 +174,7 @@ class Fifo(PlayMode):
         if status & spcm.M2STAT_DATA_OVERRUN or (ended and self._n_rendered < self._n_samples):
             share = f"{min(1.0, self._n_rendered / self._n_samples):.0%} of the program was rendered in time"
             text = f"underrun: the card ran out of samples ({share}); raise `fill`, lower sample_rate, or use"
-            raise TransientError(f"{text} the mode replay", self._card.name)
+            raise TransientError(f"{text} the mode sequence", self._card.name)
         return ended
 
     def _feed(self) -> int:

@@ -242,7 +242,8 @@ class SpcmSettings(Settings):
         """Time from a cycle's plan to its light in the mode that is used: measured, see the timing budget."""
         from labseq_spcm.certificate import permitted
 
-        return {"replay": 20e-3, "sequence": 6e-3, "fifo": 17e-3, "stream": 3e-3}[permitted(self)[0].mode]
+        mode = permitted(self)[0].mode
+        return {"replay": 20e-3, "sequence": 6e-3, "fifo": 17e-3, "stream": 3e-3}[mode]
 
     @property
     def fill_s(self) -> float:

@@ -75,7 +75,7 @@ def check_rendering(name: str, context: Context, sample_rate_hz: float, row_chan
             return
     required, reached = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, rendered_hz))
     text = f"mode: stream at {required}, but this computer renders {n_tones} moving tones at {reached}"
-    hint = "use a lower sample_rate, one with a whole number of samples per tone spacing, or mode: replay"
+    hint = "use a lower sample_rate, one with a whole number of samples per tone spacing, or mode: sequence"
     raise DeviceError(name, f"{text}; {hint}")
 
 
@@ -238,7 +238,7 @@ class Stream(PlayMode):
         rate, most = (format_quantity(hz, "frequency") for hz in (self._rate_hz, bytes_per_s / FRAME_BYTES))
         needed = FRAME_BYTES * self._rate_hz
         text = f"{what} carries {bytes_per_s / 1e9:.3g} GB/s, but mode: stream at {rate} needs"
-        hint = f"use a slot with more lanes, a sample_rate below {most}, or mode: replay"
+        hint = f"use a slot with more lanes, a sample_rate below {most}, or mode: sequence"
         return DeviceError(self._card.name, f"{text} {needed / 1e9:.3g} GB/s; {hint}")
 
     def _set_mode(self, settings: SpcmSettings) -> None:
@@ -454,7 +454,7 @@ class Stream(PlayMode):
             share = f"{played:.0%} of a part of {length} was played"
             was_full = made - start >= len(self._ring) - self._ahead - self._on_card
             remedy = (
-                f"raise `{'fill' if was_full else 'look_ahead'}`, lower sample_rate, or use the mode replay"
+                f"raise `{'fill' if was_full else 'look_ahead'}`, lower sample_rate, or use the mode sequence"
             )
             raise TransientError(
                 f"underrun: the card ran out of samples ({share}); {remedy}", self._card.name

@@ -72,10 +72,10 @@ def edited(certify: Certify) -> None:
         (
             lambda _: None,
             {},
-            "there is none of the card 12345; mode: replay without keep_warm is used instead",
+            "there is none of the card 12345; mode: sequence is used instead",
         ),
-        (lambda certify: certify(), {"serial": 0}, "`serial` does not say which card it is; mode: replay"),
-        (lambda certify: certify(stream=False), {}, "says: the card copies samples; mode: replay"),
+        (lambda certify: certify(), {"serial": 0}, "`serial` does not say which card it is; mode: sequence"),
+        (lambda certify: certify(stream=False), {}, "says: the card copies samples; mode: sequence"),
         (
             lambda certify: certify(),
             {"sample_rate": 280e6},
@@ -93,11 +93,11 @@ def test_without_it_check_says_so_in_a_line_and_the_default_mode_plays(
     (warning,) = SpcmMobileTweezers(asked, Context("awg")).warnings()
     assert re.search(text, warning)
     assert "\n" not in warning
-    assert asked.overhead_per_cycle_s == 20e-3, "plans reckon with it"
+    assert asked.overhead_per_cycle_s == 6e-3, "plans reckon with it"
     with driver("stream", **{"serial": SERIAL, **settings}) as lab:
         lab.play(lab.program(1))
         described = lab.tweezers.describe()
-        assert described["mode"] == "replay"
+        assert described["mode"] == "sequence"
         assert described["not_streamed_because"] in warning
 
 

@@ -47,7 +47,7 @@ class TestStartOfAStream:
         with driver(mode, model=replace(M4I6631)) as lab:
             lab.card._machine.model = stuck
             start_s = lab.clock.now()
-            with pytest.raises(DeviceTimeoutError, match=rf"{text}, and was not started; use mode: replay"):
+            with pytest.raises(DeviceTimeoutError, match=rf"{text}, and was not started; use mode: sequence"):
                 lab.play(lab.program(1))
             assert lab.clock.now() - start_s < 1.1
 
