@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.metadata
 import importlib.util
 import inspect
@@ -22,7 +21,7 @@ from typing import Any, Final, Literal, NamedTuple, cast
 import pluggy
 
 from labseq import __version__, hookspecs
-from labseq.errors import ConfigError, LabseqError, PluginLoadError, Problem, UnknownPluginError, one_of
+from labseq.errors import ConfigError, PluginLoadError, Problem, one_of
 from labseq.files import PLUGIN_PATH, PLUGINS
 from labseq.hookspecs import LABSEQ_API
 from labseq.messages import format_error
@@ -167,35 +166,6 @@ def module_location(name: str) -> Path | None:
     return None if spec is None or spec.origin is None else plugin_location(Path(spec.origin))
 
 
-def advice(kind: str, name: str, file: Path | None) -> str:
-    """The option or key that loads a plugin of ``./plugins``, or of that folder next to ``file``; or "".
-
-    The plugin is found in the text of the folder's files; none of them is run.
-    """
-    offers = re.compile(rf"\.{kind}\(\s*[\"']{re.escape(name)}[\"']")
-    for folder in [Path(PLUGINS)] + ([file.parent / PLUGINS] if file is not None else []):
-        with suppress(OSError, ValueError):  # the latter: another drive of Windows
-            for path in plugin_files(folder):
-                if not offers.search(path.read_text("utf-8", "replace")):
-                    continue
-                add = f"use --plugins {folder}"
-                if file is not None and file.is_file():
-                    relative = Path(os.path.relpath(folder, file.parent)).as_posix()
-                    add = f"add 'plugin_folders: [{relative}]' to {file.name}, or {add}"
-                return f"{path} offers it and is not loaded: {add}"
-    return ""
-
-
-def missing_folder(file: Path | None) -> str:
-    """A hint at the folder ``plugins`` that a file names and that was not copied along with it; or ""."""
-    with suppress(OSError, ValueError):
-        if file is None or (folder := file.parent / PLUGINS).is_dir():
-            return ""
-        if re.search(rf"^plugin_folders:.*\b{PLUGINS}\b", file.read_text("utf-8"), re.MULTILINE):
-            return f"its plugin folder {folder} does not exist"
-    return ""
-
-
 @dataclass(frozen=True, slots=True)
 class PluginInfo:
     """A plugin, and whether it was loaded.
@@ -268,7 +238,7 @@ class PluginHost:
 
     def __init__(self, max_wait_s: float = LOAD_S) -> None:
         self.registry = Registry(call_plugin)
-        self._patience_s = max_wait_s
+        self._max_wait_s = max_wait_s
         self._homes: dict[str, Path | None] = {}
         self._pluggy = _HookManager("labseq")
         self._pluggy.add_hookspecs(hookspecs)
@@ -404,7 +374,7 @@ class PluginHost:
             importing: Imports it.
         """
         self._homes[info.name] = home
-        owner = Owner(info.name, info.source, home, self._patience_s, info.notes)
+        owner = Owner(info.name, info.source, home, self._max_wait_s, info.notes)
         with self.registry.opened_for(owner) as registry:
 
             def run() -> ModuleType:
@@ -444,23 +414,11 @@ class PluginHost:
             raise self.registry.contested[kind, name]
         entry = self.registry.find(kind, name)
         if entry is None:
-            raise self._unknown(kind, name, file)
+            from labseq.plugins.unknown import unknown_plugin  # a right file needs no explanation
+
+            raise unknown_plugin(self, kind, name, file)
         self.registry.used[kind, name] = entry.origin
         return entry
-
-    def _unknown(self, kind: str, name: str, file: Path | None) -> LabseqError:
-        """The error for a name that no plugin offers: most likely its plugin did not load, or is misspelt."""
-        broken = [info for info in self._infos.values() if info.state == "failed"]
-        for info in broken:
-            if info.name.removeprefix("labseq_").split(" ")[0] == name.removeprefix("labseq_"):
-                return PluginLoadError(info.name, info.reason, info.source)
-        known = self.registry.names(kind)
-        hints = [f"did you mean '{near}'?" for near in difflib.get_close_matches(name, known, n=1)]
-        hints += [missing_folder(file), advice(kind, name, file)]
-        # steps and patterns are mostly labseq's own: such a name is more likely misspelt
-        if kind not in ("step", "pattern"):
-            hints += [f"plugin '{info.name}' did not load ({info.reason})" for info in broken]
-        return UnknownPluginError(kind, name, known, "; ".join(filter(None, hints)))
 
     def listeners(self, hook: str, **values: Any) -> list[tuple[str, Callable[[], object]]]:
         """Name of each plugin that implements an observer hook, and the call of the hook."""

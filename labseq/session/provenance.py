@@ -7,22 +7,19 @@ import getpass
 import os
 import platform
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import labseq
 from labseq.assembly.options import NOT_SET
-from labseq.calibration_store import encode_entry
 from labseq.config.addresses import PROFILE, find
-from labseq.errors import ConfigError, Loc, StopRequested
-from labseq.messages import format_error
-from labseq.model import CalibrationEntry, RunRecord
-from labseq.model.records import RunStatus, unique_names
+from labseq.errors import ConfigError, Loc
+from labseq.model import RunRecord
+from labseq.model.records import unique_names
 from labseq.plain import now_utc
 from labseq.plugins.host import name_and_version
-from labseq.recording.folders import NOTES_FILE
 from labseq.session.sources import RunCode, gather_code
 from labseq.settings import si_unit_at
 from labseq.units import si_unit_of
@@ -174,31 +171,3 @@ def _plugin_of_sequence(assembly: Assembly, loc: Loc) -> tuple[Entry | None, int
             return registry.find("step", str(kind)), 3
         case _:
             return None, 0
-
-
-def copies(calibrations: Mapping[str, CalibrationEntry]) -> dict[str, bytes | str]:
-    """The active calibrations as files for the run's folder: file name -> content."""
-    return {f"calibration_{kind}.json": encode_entry(entry) for kind, entry in calibrations.items()}
-
-
-def notes_file(note: str, tags: Sequence[str]) -> dict[str, bytes | str]:
-    """The note about a run and its tags as a file for the run's folder; {} without any.
-
-    Raises:
-        ConfigError: One is too long.
-    """
-    if not (note or tags):
-        return {}
-    from labseq.recording.notes import Notes
-
-    return {NOTES_FILE: Notes.of(note, tags).encoded()}
-
-
-def ending(error: BaseException | None) -> tuple[RunStatus, str]:
-    """The status in which a run ended, and the reason."""
-    if error is None:
-        return "complete", ""
-    if isinstance(error, StopRequested):
-        return "stopped", str(error)
-    status: RunStatus = "stopped" if isinstance(error, KeyboardInterrupt) else "failed"
-    return status, format_error(error)

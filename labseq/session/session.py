@@ -14,14 +14,16 @@ from typing import TYPE_CHECKING, Any, ParamSpec, Self
 from labseq.assembly.assemble import Assembly, assemble
 from labseq.assembly.options import DryRun, Options, path_of
 from labseq.assembly.point import Point
+from labseq.calibration_store import encode_entry
 from labseq.data.reader import Run, open_run
 from labseq.errors import ConfigError, DeviceError, RecordingError, StopRequested
 from labseq.guard import stop_on_signals
-from labseq.messages import error_text, visible
+from labseq.messages import error_text, format_error, visible
 from labseq.model import RunRecord, ShotRecord
+from labseq.model.records import RunStatus
 from labseq.realtime import real_time
 from labseq.recording import clear_active, data_root, find_dead_run, mark_active
-from labseq.recording.folders import NOTIFY_FILE, SOURCES_FILE, STOP_FILE, later_day
+from labseq.recording.folders import NOTES_FILE, NOTIFY_FILE, SOURCES_FILE, STOP_FILE, later_day
 from labseq.recording.index import IndexRow
 from labseq.recording.writer import RunWriter
 from labseq.roles import RunObserver
@@ -33,7 +35,7 @@ from labseq.session.alarms import Alarms
 from labseq.session.check import check
 from labseq.session.checks import Checks
 from labseq.session.prepared import PreparedRun
-from labseq.session.provenance import code_of, copies, ending, notes_file, run_record
+from labseq.session.provenance import code_of, run_record
 from labseq.session.sources import RunCode
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
@@ -186,7 +188,7 @@ class Session(PreparedRun):
         root = earlier.root if earlier else options.output or data_root()
         super().__init__(assembly, observer, paced=options.realtime, root=root, run=before, done=done)
         self.options = options
-        self._notes = notes_file(options.note, options.tags)
+        self._notes = _notes_file(options.note, options.tags)
         self.earlier = earlier
         self._warnings = warnings
         self.run_dir: Path | None = None
@@ -419,7 +421,7 @@ class Session(PreparedRun):
                 error = failure
                 raise
             finally:
-                status, text = ending(error)
+                status, text = _ending(error)
                 self._try(writer.finish, status, text)
                 self.observers.event("run_finished", {"record": record, "status": status, "error": text})
 
@@ -487,8 +489,9 @@ class Session(PreparedRun):
             code = code_of(self.assembly, self._cwd)
         record = run_record(self.assembly, self.seed, changes, self._cwd, code)
         if earlier is None:
-            extra_files = copies(self.assembly.hardware.calibrations) | self._notes
-            extra_files |= {SOURCES_FILE: code.archive}
+            calibrations = self.assembly.hardware.calibrations.items()
+            extra_files = {f"calibration_{kind}.json": encode_entry(entry) for kind, entry in calibrations}
+            extra_files |= self._notes | {SOURCES_FILE: code.archive}
             writer = RunWriter.create(self.root, record, extra_files, self.stop_flag)
         else:
             first_shot = None if first is None else self.history.to_take[0]
@@ -510,3 +513,26 @@ class Session(PreparedRun):
             act(*args, **kwargs)
         except Exception as failure:  # noqa: BLE001 - nothing hides the error that ended the run
             self.warn(error_text(failure))
+
+
+def _notes_file(note: str, tags: Sequence[str]) -> dict[str, bytes]:
+    """The note about a run and its tags as a file for the run's folder; {} without any.
+
+    Raises:
+        ConfigError: One is too long.
+    """
+    if not (note or tags):
+        return {}
+    from labseq.recording.notes import Notes
+
+    return {NOTES_FILE: Notes.of(note, tags).encoded()}
+
+
+def _ending(error: BaseException | None) -> tuple[RunStatus, str]:
+    """The status in which a run ended, and the reason."""
+    if error is None:
+        return "complete", ""
+    if isinstance(error, StopRequested):
+        return "stopped", str(error)
+    status: RunStatus = "stopped" if isinstance(error, KeyboardInterrupt) else "failed"
+    return status, format_error(error)

@@ -82,39 +82,41 @@ def gather_code(host: PluginHost, sequence_folder: Path, also: Collection[str] =
         also: Names of others that are wanted.
     """
     own, sequence_root, plugins = Path(labseq.__file__).parent, _root_of(sequence_folder), host.used(also)
-    homes = [own if plugin.is_built_in else plugin.home for plugin in plugins]
+    homes = {plugin.name: own if plugin.is_built_in else plugin.home for plugin in plugins}
     with ThreadPoolExecutor(1) as thread:  # git takes longer than all else here
-        states = thread.submit(
-            repositories, [path for path in (own, sequence_root, *homes) if path is not None]
-        )
-        sources = [
-            _read(home) if plugin.is_from_folder else _read_once(home)
-            for plugin, home in zip(plugins, homes, strict=True)
-        ]
-        archived = {
-            f"{plugin.name}/{name}": data
-            for plugin, (files, _) in zip(plugins, sources, strict=True)
-            for name, data in files.items()
-            if not plugin.is_built_in  # it is 1 MB more for each run, and in the commit or the release
+        paths = [path for path in {own, sequence_root, *homes.values()} if path is not None]
+        states = thread.submit(repositories, paths)
+        sources = {
+            plugin.name: (_read if plugin.is_from_folder else _read_once)(homes[plugin.name])
+            for plugin in plugins
         }
-    repository_of: Mapping[Path | None, Repository] = {**states.result()}
-    code, sequence = repository_of.get(own), repository_of.get(sequence_root)
-    if code is not None and code.diff:
-        archived[LABSEQ_DIFF] = code.diff.encode()
+    repository_of = states.result()
+
+    def git(path: Path | None) -> dict[str, Any] | None:
+        return repository_of[path].plain() if path in repository_of else None
+
+    archived = {
+        f"{plugin.name}/{name}": data
+        for plugin in plugins
+        if not plugin.is_built_in  # it is 1 MB more for each run, and in the commit or the release
+        for name, data in sources[plugin.name].files.items()
+    }
+    if own in repository_of and repository_of[own].diff:
+        archived[LABSEQ_DIFF] = repository_of[own].diff.encode()
     records = tuple(
         {
             "name": plugin.name,
             "origin": plugin.origin,
             "version": plugin.version,
-            "path": str(home or ""),
-            "sha256": sha256,
-            "git": _plain(repository_of.get(home)),
+            "path": str(homes[plugin.name] or ""),
+            "sha256": sources[plugin.name].sha256,
+            "git": git(homes[plugin.name]),
             "used": [*plugin.offers],
         }
-        for plugin, home, (_, sha256) in zip(plugins, homes, sources, strict=True)
+        for plugin in plugins
     )
     return RunCode(
-        records, {"code": _plain(code), "sequence": _plain(sequence)}, _zipped(tuple(archived.items()))
+        records, {"code": git(own), "sequence": git(sequence_root)}, _zipped(tuple(archived.items()))
     )
 
 
@@ -188,10 +190,6 @@ def repositories(paths: Collection[Path]) -> dict[Path, Repository]:
         states = dict(zip(different, threads.map(_state_of, different), strict=True))
         tracked = [path for path, listing in zip(roots, listings, strict=True) if listing]
     return {path: state for path in tracked if (state := states[roots[path]]) is not None}
-
-
-def _plain(repository: Repository | None) -> dict[str, Any] | None:
-    return None if repository is None else repository.plain()
 
 
 def _root_of(path: Path) -> Path | None:
