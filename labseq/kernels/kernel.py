@@ -232,15 +232,16 @@ class _Kernel:
     def _dispatcher(self, kind: str) -> Any:
         with _LOADING:
             if not self.signatures and kind not in self._dispatchers:
-                self._compile(kind, cache=False)  # its callers' caches hold it
+                self._compile(kind, None)  # its callers' caches hold it
             elif kind not in self._dispatchers:
                 self._cached(kind, partial(self._compile, kind))
         return self._dispatchers[kind]
 
-    def _compile(self, kind: str, cache: bool) -> None:
+    def _compile(self, kind: str, file: Path | None) -> None:
+        """Compile for Python or for other kernels; see :meth:`_function` for ``file``."""
         # only what Python calls can take Python's objects: that takes a fifth of the time for compiling
-        options = self._options | {"cache": cache, "no_cpython_wrapper": kind == "kernels"}
-        dispatcher = self._dispatchers[kind] = _numba().njit(**options)(self._function(cache))
+        options = self._options | {"cache": file is not None, "no_cpython_wrapper": kind == "kernels"}
+        dispatcher = self._dispatchers[kind] = _numba().njit(**options)(self._function(file))
         try:
             for signature in self.signatures:
                 dispatcher.compile(signature)  # which may need the dispatcher, for calls of itself
@@ -261,47 +262,49 @@ class _Kernel:
             self._cached("c", self._compile_for_c)
         return int(self._c.address)
 
-    def _compile_for_c(self, cache: bool) -> None:
+    def _compile_for_c(self, file: Path | None) -> None:
         options = {key: value for key, value in self._options.items() if key != "nogil"}
-        self._c: Any = _numba().cfunc(self.signatures[0], cache=cache, **options)(self._function(cache))
+        compiler = _numba().cfunc(self.signatures[0], cache=file is not None, **options)
+        self._c: Any = compiler(self._function(file))
 
-    def _function(self, cache: bool) -> FunctionType:
-        """The function; for the cache as if it stood alone in a file of the kernel's folder.
+    def _function(self, file: Path | None) -> FunctionType:
+        """The function as if it stood alone in a file, for numba's cache; None for no cache.
 
         numba looks at the file of a function and at its line, and would compile it again in another copy
         of labseq, or after another function in its file was edited.
         """
         function = self.function
-        if not cache:
+        if file is None:
             return function
-        code = function.__code__.replace(co_filename=str(self.folder / "kernel.py"), co_firstlineno=1)
+        code = function.__code__.replace(co_filename=str(file), co_firstlineno=1)
         return FunctionType(
             code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
         )
 
-    def _cached(self, kind: str, compile_it: Callable[[bool], None]) -> None:
-        """Compile with numba's cache in the kernel's folder."""
-        folder, settings = self.folder / kind, _numba().config
+    def _cached(self, kind: str, compile_it: Callable[[Path | None], None]) -> None:
+        """Compile with numba's cache in the kernel's folder, or without it if that cannot be written to."""
+        home, settings = self.folder, _numba().config
+        folder, file = home / kind, home / "kernel.py"
         if not folder.is_dir():
             _announce_compiling(self)
-        before, can_write = settings.CACHE_DIR, False
+        before, cached_file = settings.CACHE_DIR, None
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
-            os.utime(folder.parent)
-            _delete_unused(folder.parents[1])
+            os.utime(home)
+            _delete_unused(home.parent)
             with suppress(FileExistsError):  # numba before 0.63 knows it by its date
-                (folder.parent / "kernel.py").touch(exist_ok=False)
-            can_write = True
+                file.touch(exist_ok=False)
+            cached_file = file
         settings.CACHE_DIR = str(folder)
         try:
-            compile_it(can_write)
+            compile_it(cached_file)
         except Exception:  # noqa: BLE001 - a crash may have truncated any file; other errors come again
             shutil.rmtree(folder, ignore_errors=True)
             _announce_compiling(self)
             try:
-                compile_it(can_write)
+                compile_it(cached_file)
             except Exception:  # noqa: BLE001 - it comes again, and names the line in the author's file
-                compile_it(False)
+                compile_it(None)
         finally:
             settings.CACHE_DIR = before
         _PENDING.pop(self, None)
