@@ -63,6 +63,9 @@ NEEDS = {
         "uv sync --all-extras --all-groups; apt-get install chromium",
     ),
     "libaravis": Need(lambda: find_library("aravis-0.8") is not None, "apt-get install libaravis-0.8-0"),
+    "aravis-tools": Need(
+        lambda: shutil.which("arv-fake-gv-camera-0.8") is not None, "apt-get install aravis-tools"
+    ),
     "soapy-module": Need(
         lambda: _compiles("c++", ".cpp", "SoapySDR/Device.hpp") and find_library("SoapySDR") is not None,
         "apt-get install g++ libsoapysdr0.8 libsoapysdr-dev",

@@ -12,6 +12,7 @@ from labseq_aravis.library import (
     library_version,
     load_library,
 )
+from labseq_aravis.sockets import buffer_size, granted
 from labseq_aravis.stream import Buffer, Stream, StreamOptions
 
 __all__ = [
@@ -23,7 +24,9 @@ __all__ = [
     "PixelFormatError",
     "Stream",
     "StreamOptions",
+    "buffer_size",
     "find_cameras",
+    "granted",
     "library_version",
     "load_library",
 ]

@@ -69,6 +69,7 @@ TYPES: Final[dict[str, Any]] = {
     "b": ctypes.c_int,
     "i": ctypes.c_int,
     "u": ctypes.c_uint,
+    "h": ctypes.c_uint16,
     "l": ctypes.c_int64,
     "L": ctypes.c_uint64,
     "d": ctypes.c_double,
@@ -154,6 +155,7 @@ SIGNATURES: Final[dict[str, str]] = {
     "arv_buffer_get_status": "i p",
     "arv_buffer_get_timestamp": "L p",
     "arv_buffer_new_allocate": "p z",
+    "arv_gv_stream_get_port": "h p",
     "arv_stream_push_buffer": "v pp",
     "arv_stream_timeout_pop_buffer": "p pL",
     # the simulated camera
@@ -170,8 +172,8 @@ SIGNATURES: Final[dict[str, str]] = {
 """Types of the C functions that are called, by name: a letter of the result, then those of the arguments.
 
 They follow the headers of Aravis 0.8.26 and of GLib 2: ``v`` nothing, ``p`` any pointer, ``s`` text, ``b``
-gboolean, ``i`` gint or an enumeration, ``u`` guint, ``l`` gint64, ``L`` guint64, ``d`` double, ``z`` gsize or
-GType, ``g`` gulong. A last argument ``e`` is the place for a GError.
+gboolean, ``i`` gint or an enumeration, ``u`` guint, ``h`` guint16, ``l`` gint64, ``L`` guint64, ``d`` double,
+``z`` gsize or GType, ``g`` gulong. A last argument ``e`` is the place for a GError.
 """
 
 NAMES: Final[dict[str, tuple[tuple[str, ...], ...]]] = {

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from labseq_aravis.library import AravisError, Library, PixelFormatError
+from labseq_aravis.sockets import buffer_size, set_buffer_size
 
 if TYPE_CHECKING:
     import numpy as np
@@ -69,11 +70,6 @@ STATUS_NAMES: Final = (
 )
 """Names of the library's ``ArvBufferStatus``, from 0."""
 
-FRAMES_IN_SOCKET: Final = 4
-MIN_SOCKET_BUFFER: Final = 2**20
-"""Size of the socket's buffer, in frames, and its minimum size, in bytes. A buffer for one frame, the
-library's default, loses packets: the kernel counts each packet with its overhead, up to twice its size."""
-
 
 @dataclass(frozen=True, slots=True)
 class StreamOptions:
@@ -128,8 +124,11 @@ class Stream:
         ):
             if time_s is not None:
                 self._set(name, round(time_s * 1e6))
+        n_bytes = buffer_size(payload)
         self._set("socket-buffer", 0)  # fixed
-        self._set("socket-buffer-size", max(FRAMES_IN_SOCKET * payload, MIN_SOCKET_BUFFER))
+        self._set("socket-buffer-size", n_bytes)
+        # the library does so only when the first packet has come, too late for the others of its frame
+        set_buffer_size(self._library.arv_gv_stream_get_port(self._open_handle()), n_bytes)
 
     def allocate(self, n_buffers: int, payload: int) -> None:
         """Add buffers of ``payload`` bytes each."""

@@ -15,6 +15,8 @@ from labseq_aravis import (
     LibraryMissingError,
     Stream,
     StreamOptions,
+    buffer_size,
+    granted,
     load_library,
 )
 
@@ -59,6 +61,20 @@ def simulated_settings() -> dict[str, str | None] | str:
     except LibraryMissingError as error:
         return f"{error}, which the simulated camera needs"
     return {"camera": SIMULATED, "model": None, "serial": None}
+
+
+def buffer_note(payload: int, room: int) -> str:
+    """What to do where a frame of ``payload`` bytes may be more than a socket holds; empty where it is not.
+
+    Args:
+        payload: Size of a frame, in bytes.
+        room: Bytes that a socket gets; the kernel counts packets at up to twice their size.
+    """
+    if room >= 2 * payload:
+        return ""
+    frame, limit = f"{payload / 1024:.0f} KiB", f"net.core.rmem_max is {room / 1024:.0f} KiB"
+    command = f"sysctl -w net.core.rmem_max={buffer_size(payload)}"
+    return f"a frame of {frame} may not fit into the buffer of its socket: {limit}; raise it with `{command}`"
 
 
 def connection_for(settings: GenicamSettings, context: Context) -> AravisConnection:
@@ -106,6 +122,7 @@ class AravisConnection(Connection):
         self.packet_size = settings.packet_size
         self.camera: Camera | None = None
         self._is_gone = False
+        self._buffer_note = ""
         self._stream: Stream | None = None
         self._trigger: Trigger | None = None  # while it acquires
         self._counter = FrameCounter()
@@ -148,7 +165,15 @@ class AravisConnection(Connection):
                 camera.set_packet_size(self.packet_size)
             if delay_s is not None:
                 camera.set_packet_delay_s(delay_s)
-            return {"packet_size_now": camera.packet_size if camera.is_ethernet else None}
+            if not camera.is_ethernet:
+                return {"packet_size_now": None}
+            payload = camera.payload
+            self._buffer_note = buffer_note(payload, self.granted(buffer_size(payload)))
+            return {"packet_size_now": camera.packet_size, "notes": [*filter(None, [self._buffer_note])]}
+
+    def granted(self, n_bytes: int) -> int:
+        """Bytes that a socket gets which requests ``n_bytes``."""
+        return granted(n_bytes)
 
     def close(self) -> None:
         """Release the camera; repeatable. If it is gone this takes the library 10 s, so a thread does it."""
@@ -229,6 +254,8 @@ class AravisConnection(Connection):
             self.stop()
         time_s = 1e-9 * buffer.camera_time_ns if buffer.camera_time_ns else math.nan
         fault = FAULTS.get(buffer.status, f"its buffer is '{buffer.status}'")
+        if fault == INCOMPLETE and self._buffer_note:
+            fault = f"{fault}; {self._buffer_note}"
         return ExposureResult(number, buffer.image, fault, device_time_s=time_s)
 
     def end(self) -> None:

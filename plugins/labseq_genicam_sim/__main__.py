@@ -91,9 +91,10 @@ class SimulatedCamera:
         names = ("OffsetX", "OffsetY", "Width", "Height", "BinningHorizontal", "BinningVertical")
         names += ("ReverseX", "ReverseY")
         values = (self._register(REGISTERS[name]) for name in names)
+        payload = self._library.arv_fake_camera_get_payload(self._registers)
         if self._cable is not None:
             host = self._register(STREAM_ADDRESS).to_bytes(4, "big")
-            self._cable.aim(socket.inet_ntoa(host), self._register(STREAM_PORT) & 0xFFFF)
+            self._cable.aim(socket.inet_ntoa(host), self._register(STREAM_PORT) & 0xFFFF, payload)
         image = self._expose(Exposure(n, exposure_us, gain, pixel_format, *values)) or b""
         faults = self.faults
         if faults.unplugged_at is not None and n >= faults.unplugged_at:
@@ -102,10 +103,9 @@ class SimulatedCamera:
             time.sleep(faults.late_by)
         size = ctypes.c_size_t()
         address = self._library.arv_buffer_get_data(buffer, ctypes.byref(size))
-        room = self._library.arv_fake_camera_get_payload(self._registers)
-        is_whole = len(image) == room
+        is_whole = len(image) == payload
         if is_whole:
-            ctypes.memmove(address, image, room)
+            ctypes.memmove(address, image, payload)
         self._lose(faults.packet_loss if is_whole and n not in faults.failed_frames else HALF, n)
 
     def _lose(self, fraction: float, n: int) -> None:

@@ -47,6 +47,10 @@ class SimulatedConnection(SimulatedExposures, AravisConnection):
         self.clear()
         self._fake.stop()
 
+    def granted(self, n_bytes: int) -> int:
+        """All of it: the simulated camera sends no more than a socket has room for."""
+        return n_bytes
+
     def expose(self, t_s: float | None, exposure_s: float | None) -> None:
         """Begin an exposure; a camera that ignores triggers is only sent one."""
         if self._ignores_triggers:

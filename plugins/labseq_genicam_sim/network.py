@@ -4,19 +4,17 @@ Aravis' simulated camera uses port 3956 of a network interface's first address, 
 one camera at a time. On Linux the whole of 127.0.0.0/8 is loopback, so the camera's sockets are replaced by
 sockets at another address as soon as it runs, and 127.0.0.1 is free again for the next camera.
 
-The library sends a whole frame at once. Linux gives a socket a buffer of 212992 bytes by default
-(``net.core.rmem_default``) and counts each packet with its overhead; the library requests more only when it
-reads the first packet of a stream. Half of the frames of 512 x 512 pixels were lost. So packets wait in a
-:class:`Cable` until the receiver has room, as with the pause frames of Ethernet.
+The library sends a whole frame at once. A :class:`Cable` forwards the packets as fast as it can, so that a
+receiver whose socket has only the default buffer (``net.core.rmem_default``, 208 KiB) loses packets, as with
+other cameras. Packets wait in the cable while there are more than a well configured socket holds, as with the
+pause frames of Ethernet: four frames, or what the kernel allows (``net.core.rmem_max``).
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import socket
-import stat
 import sys
 import threading
 import time
@@ -24,16 +22,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from labseq_aravis.sockets import buffer_size, granted, udp_sockets
+
 FIRST_ADDRESS: Final = "127.0.0.1"
 PORT: Final = 3956
 """Port of the control channel (GVCP), fixed by GigE Vision."""
 
-_HIGHEST_FD: Final = 64  # of a process that has just started
-
 
 def has_port() -> bool:
     """Whether the camera that was just started in this process got its control channel."""
-    return any(port == PORT and host == FIRST_ADDRESS for _, (host, port) in _udp_sockets())
+    return any(port == PORT and host == FIRST_ADDRESS for _, _, (host, port) in udp_sockets())
 
 
 def move(address: str) -> Cable | None:
@@ -45,7 +43,7 @@ def move(address: str) -> Cable | None:
     """
     if sys.platform != "linux":
         return None
-    made = [(fd, port) for fd, (host, port) in _udp_sockets() if host == FIRST_ADDRESS]
+    made = [(fd, port) for _, fd, (host, port) in udp_sockets() if host == FIRST_ADDRESS]
     try:
         control, out = _bound(address, PORT), _bound(address, 0)
     except OSError:
@@ -78,21 +76,6 @@ def _bound(address: str, port: int) -> socket.socket:
     return new
 
 
-def _udp_sockets() -> Iterator[tuple[int, tuple[str, int]]]:
-    """File descriptor, address and port of each UDP socket of this process."""
-    for fd in range(3, _HIGHEST_FD):
-        with contextlib.suppress(OSError):
-            if not stat.S_ISSOCK(os.fstat(fd).st_mode):
-                continue
-            with socket.socket(fileno=os.dup(fd)) as twin:
-                if twin.family == socket.AF_INET and twin.type == socket.SOCK_DGRAM:
-                    host, port = twin.getsockname()
-                    yield fd, (host, port)
-
-
-BURST: Final = 64 * 1024
-"""Bytes that are sent before the receiver's free space is checked; twice as many always fit."""
-
 OVERHEAD: Final = 768
 """Bytes that Linux counts for a packet in addition to its own."""
 
@@ -108,7 +91,8 @@ SOCKETS: Final = Path("/proc/net/udp")
 LARGEST_PACKET: Final = 65536
 
 AIM: Final = b"\xff\xffto "
-"""Prefix of a message with the destination of the following packets; no packet has this status."""
+"""Prefix of a message with the destination of the following packets and the room there; no packet has this
+status."""
 
 
 class Cable(threading.Thread):
@@ -130,35 +114,40 @@ class Cable(threading.Thread):
         self._out = out
         self.address: str = out.getsockname()[0]
         self._aimed_at = self._destination = "", 0
+        self._room = 0
         self._is_read = True
 
-    def aim(self, host: str, port: int) -> None:
-        """Set the destination of later frames; packets already in the cable keep theirs."""
+    def aim(self, host: str, port: int, payload: int) -> None:
+        """Set the destination of later frames, of ``payload`` bytes; packets in the cable keep theirs."""
         if (host, port) != self._aimed_at:
             self._aimed_at = host, port
+            room = granted(buffer_size(payload))
             select.select([], [self.end], [])
-            self.end.send(AIM + f"{host}:{port}".encode())
+            self.end.send(AIM + f"{host}:{port}:{room}".encode())
 
     def run(self) -> None:
         """Forward packets until this process ends."""
-        n_bytes = 0
+        left = 0
         while packet := self._own.recv(LARGEST_PACKET):
             if packet.startswith(AIM):
-                host, _, port = packet.removeprefix(AIM).decode().rpartition(":")
-                self._destination, self._is_read = (host, int(port)), True
+                host, port, room = packet.removeprefix(AIM).decode().split(":")
+                self._destination, self._is_read, self._room = (host, int(port)), True, int(room)
+                left = self._room
                 continue
+            if left <= 0 and self._is_read:
+                left = self._wait_for_room()
             self._out.sendto(packet, self._destination)
-            n_bytes += len(packet) + OVERHEAD
-            if n_bytes >= BURST and self._is_read:
-                n_bytes = 0
-                self._is_read = self._wait_for_room()
+            left -= len(packet) + OVERHEAD
 
-    def _wait_for_room(self) -> bool:
+    def _wait_for_room(self) -> int:
+        """Wait until half of the receiver's room is free; returns the bytes that can be sent."""
         for _ in range(MAX_BREAKS):
-            if n_waiting(self._destination[1]) < BURST:
-                return True
+            waiting = n_waiting(self._destination[1])
+            if waiting <= self._room // 2:
+                return self._room - waiting
             time.sleep(BREAK_S)
-        return False
+        self._is_read = False
+        return 0
 
 
 def n_waiting(port: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import sys
 from functools import partial
 from typing import Any
@@ -10,9 +11,11 @@ from typing import Any
 import labseq_aravis.library as aravis_library
 import pytest
 from labseq_aravis import load_library
+from labseq_genicam_sim.messages import Faults
 
 from labseq import DeviceError, LimitError, TransientError
 from labseq.errors import DeviceTimeoutError
+from labseq.roles import NeverStopped
 
 from .labseq_camera_rig import Rig, assert_shown, opened_rig
 from .labseq_genicam_rig import WAIT_S, needs_aravis, plugged_in
@@ -79,6 +82,27 @@ def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
         frames.append(lab.camera.read(1.0))
         assert [frame.number for frame in frames] == [0, 2]
         assert_shown(frames, lab)
+
+
+@needs_aravis
+def test_a_limit_of_the_kernel_that_is_too_small_for_a_frame_is_named_with_the_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    text = "512 KiB may not fit .* 208 KiB; raise it with `sysctl -w net.core.rmem_max=2097152`"
+    monkeypatch.setattr("labseq_genicam.aravis.granted", lambda _: 212992)
+    with (
+        plugged_in(faults=Faults(failed_frames=[0]), sensor_shape=LARGE) as fake,
+        rig(fake.address, clock=NeverStopped(), frame_timeout="50 ms") as lab,
+    ):
+        (note,) = lab.camera.describe()["notes"]
+        assert re.search(text, note)
+        lab.camera.arm(1, 1e-3, "software")
+        lab.camera.trigger()
+        with pytest.raises(TransientError, match=f"network packets are missing; .*{text}"):
+            lab.camera.read(WAIT_S)
+    monkeypatch.setattr("labseq_genicam.aravis.granted", lambda n_bytes: n_bytes)
+    with rig() as lab:
+        assert lab.camera.describe()["notes"] == []
 
 
 @needs_aravis
