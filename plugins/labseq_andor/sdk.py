@@ -35,6 +35,7 @@ class Capabilities(ctypes.Structure):
 TYPES: Final[dict[str, Any]] = {
     "i": ctypes.c_int32,
     "u": ctypes.c_uint32,
+    "l": ctypes.c_long,
     "f": ctypes.c_float,
     "p": ctypes.c_void_p,
     "c": Capabilities,
@@ -116,7 +117,7 @@ SIGNATURES: Final[dict[str, str]] = {
     "AbortAcquisition": " ",
     "SendSoftwareTrigger": " ",
     "GetStatus": " i",
-    "WaitForAcquisitionByHandleTimeOut": "ii ",
+    "WaitForAcquisitionByHandleTimeOut": "li ",
     "CancelWait": " ",
     "GetNumberNewImages": " ii",
     "GetImages16": "iipu ii",
@@ -124,8 +125,9 @@ SIGNATURES: Final[dict[str, str]] = {
 }
 """Types of the functions, by name: letters of what is passed, a space, those of what pointers lead to.
 
-They follow Andor's header: ``i`` int or at_32, ``u`` unsigned int or at_u32, ``f`` float, ``p`` any pointer,
-``c`` :class:`Capabilities`, ``s`` text, ``n`` text whose length is passed, too.
+They follow Andor's headers ``atmcd32d.h`` and, for Linux, ``atmcdLXd.h``: ``i`` int or at_32 and ``u``
+unsigned int or at_u32, of 32 bits on every system, ``l`` long, which has 64 bits under 64-bit Linux, ``f``
+float, ``p`` any pointer, ``c`` :class:`Capabilities`, ``s`` text, ``n`` text whose length is passed, too.
 """
 
 
