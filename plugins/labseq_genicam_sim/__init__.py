@@ -28,6 +28,7 @@ not simulated      sequences of n frames, chunk data, events, temperature, shutt
 One thread does everything: while a frame is made, the camera answers nothing. Failures are chosen by
 :class:`labseq_genicam_sim.messages.Faults`.
 
-On Linux each camera has its own address, and packets wait until the receiver has room. On other systems there
-is one camera per machine at a time, and packets may be lost; that was not tested.
+On Linux each camera has its own address, and a frame is sent at once, as far as a well configured socket has
+room for it. On other systems there is one camera per machine at a time, and packets may be lost; that was not
+tested.
 """
