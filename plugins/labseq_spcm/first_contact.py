@@ -92,7 +92,8 @@ def _steps(bench: Bench, full_scale: str) -> Iterator[ContactStep]:
     )  # fmt: skip
     yield step(
         "overwrite", f"writes 20 bursts over silence, 10 ms apart; {at_80_mv}", 20, scope.overwrite,
-        needs="scope", prepare=f"{load}; 50 ms per division, single shot at 40 mV", readings=scope.OVERWRITE,
+        needs="scope", prepare=f"{load}; 50 ms per division with peak detection, single shot at 40 mV",
+        readings=scope.OVERWRITE,
     )  # fmt: skip
     yield step(
         "trigger", f"plays a pulse at each edge at Ext0 for 10 s; {at_80_mv}", 30, scope.trigger,

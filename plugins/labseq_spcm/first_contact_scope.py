@@ -49,9 +49,12 @@ RAMP: Final = (
 
 
 def tone(n_samples: int) -> NDArray[np.int16]:
-    """A tone of eight periods on both outputs, which can be repeated, int16 (n_samples, 2)."""
+    """A tone of eight periods on both outputs, which can be repeated, int16 (n_samples, 2).
+
+    It begins at full scale, so that an oscilloscope shows its first sample as an edge.
+    """
     turns = 8 * np.arange(n_samples) / n_samples
-    return np.repeat(np.rint(32767 * np.sin(2 * np.pi * turns)).astype(np.int16)[:, np.newaxis], 2, axis=1)
+    return np.repeat(np.rint(32767 * np.cos(2 * np.pi * turns)).astype(np.int16)[:, np.newaxis], 2, axis=1)
 
 
 def relay_steps(bench: Bench) -> dict[str, Any]:

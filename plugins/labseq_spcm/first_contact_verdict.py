@@ -19,6 +19,8 @@ COPIED_S_PER_BYTE: Final = 1 / 50e9
 """A hand-over that takes longer copies the samples: no processor copies at 50 GB/s (ours)."""
 DELAY_TOLERANCE_S: Final = 20e-9
 """By how much the delay of the trigger may differ from the manual's (ours: the worth of a scope reading)."""
+LARGEST_NOTIFY_BYTES: Final = 1 << 19
+"""The largest ``notify_size`` that the driver takes."""
 HOT_C: Final = 80
 """Limit of both sensors (manual, p. 202)."""
 
@@ -27,7 +29,7 @@ def _write_speed(result: Result, settings: SpcmSettings) -> str:
     needed = FRAME_BYTES * settings.sample_rate
     speeds = {int(size): float(speed) for size, speed in result["user"]}
     speed = speeds.get(settings.notify_size, 0.0)
-    enough = [size for size, speed in speeds.items() if speed >= needed]
+    enough = [size for size, speed in speeds.items() if speed >= needed and size <= LARGEST_NOTIFY_BYTES]
     hint = f"notify_size {min(enough)} is enough" if enough else "no notify size is enough"
     text = f"blocks of {settings.notify_size >> 10} KiB are written at {speed / 1e9:.3g} GB/s"
     return f"{text}, and the sample rate needs {needed / 1e9:.3g} ({hint})" if speed < needed else ""
