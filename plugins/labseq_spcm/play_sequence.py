@@ -100,6 +100,8 @@ class SequenceReplay(PlayMode):
         self._is_on = False
         self._divide_memory()
         self._buffers = (Buffer(), Buffer())
+        for buffer in self._buffers:
+            buffer.reserve(2 * CHUNK)[:] = 0  # so that the memory is there
         idle = Buffer().reserve(n_idle)
         idle[:] = 0
         if keep_warm is not None:
@@ -212,9 +214,10 @@ class SequenceReplay(PlayMode):
     def _split(self, ends: Sequence[int], size: int) -> Iterator[Part]:
         """Split what is linked at once, and ends at these samples, into parts of about equal size."""
         for start, end in itertools.pairwise([0, *ends]):
-            n, first = max(1, round((end - start) / size), -(-(end - start) // self._room)), self._n_parts
-            stops = [start + math.ceil((end - start) * i / n / SAMPLE_STEP) * SAMPLE_STEP for i in range(n)]
-            for part_start, stop in itertools.pairwise([*stops, end]):
+            length, first = end - start, self._n_parts
+            n = max(1, round(length / size), math.ceil(length / self._room))
+            starts = [start + math.ceil(length * i / n / SAMPLE_STEP) * SAMPLE_STEP for i in range(n)]
+            for part_start, stop in itertools.pairwise([*starts, end]):
                 yield Part(self._n_parts, part_start, stop, first, stop == end)
                 self._n_parts += 1
 
@@ -251,7 +254,7 @@ class SequenceReplay(PlayMode):
             return
         self._write_step(waits, IDLE_SEGMENT, waits)
         self._write_step(plays, part.number + 1, waits)
-        if part.first:
+        if part.first:  # to part 0 the idle step leads, in `start`
             self._follow(part.first)
         self._end = waits
 

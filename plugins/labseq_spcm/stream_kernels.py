@@ -387,9 +387,12 @@ def start_when_filled(box: Words) -> int:
             box[FILLED_BY_NS] = box[NOW_NS] + FILLING_NS
         return STUCK if box[NOW_NS] > box[FILLED_BY_NS] else FILLING_POLL_NS
     box[IS_FILLING] = box[FILLED_BY_NS] = box[SHIFT] = 0
-    box[STARTED_NS], box[WINDOW_NS] = box[NOW_NS], box[NOW_NS] + FOLLOWED_NS
     box[LEAST_LAG] = box[USUAL_LAG] = UNKNOWN
-    return FAILED if call_library(box, box[SET], COMMAND, box[START_COMMAND]) else 0
+    error = call_library(box, box[SET], COMMAND, box[START_COMMAND])
+    if box[TIMER]:  # the card plays from some time during the call: reckon with the latest
+        box[NOW_NS] = now_ns(carray(pointer(box[TIMER]), N_TIMER, np.int64))
+    box[STARTED_NS], box[WINDOW_NS] = box[NOW_NS], box[NOW_NS] + FOLLOWED_NS
+    return FAILED if error else 0
 
 
 @kernel("int64(int64[::1], int64)")

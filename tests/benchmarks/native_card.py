@@ -178,6 +178,7 @@ class NativeFifo(Fifo):
         if self._now_s == -math.inf:
             self._now_s = now_s
         flow_until(self.words, now_s)
+        self._reported.add(now_s, self.fetched)
 
 
 class NativeLibrary(SimulatedLibrary):
