@@ -89,8 +89,9 @@ class SpcmMobileTweezers(MobileTweezers):
             if settings.mode == "stream":
                 raise ConfigError(f"{self._name}: a line triggers it, but mode: stream {NO_TRIGGER}")
             settings = settings.model_copy(update={"trigger": "external"})
-        self._settings, self._uncertified = permitted(settings)
-        settings = self._settings
+        self._dropped = " without keep_warm" if settings.keep_warm is not None else ""
+        settings, self._uncertified = permitted(settings)
+        self._settings = settings
         self._context = context
         self._clock = context.clock
         self._rf = context.motion.rf
@@ -146,7 +147,7 @@ class SpcmMobileTweezers(MobileTweezers):
         found = limits.reference_warnings(self._name, settings.sample_rate, settings.reference_clock, grid)
         if self._uncertified:
             what = f"profile.{self._name}.mode is stream, which needs the certificate of a first contact, and"
-            why = f"{self._uncertified}; mode: {settings.mode} without keep_warm is used instead"
+            why = f"{self._uncertified}; mode: {settings.mode}{self._dropped} is used instead"
             found.append(f"{what} {why} until 'labseq first-contact' has made one")
         return found + self._rendering_warnings()
 
