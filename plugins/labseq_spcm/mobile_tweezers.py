@@ -89,8 +89,8 @@ class SpcmMobileTweezers(MobileTweezers):
             if settings.mode == "stream":
                 raise ConfigError(f"{self._name}: a line triggers it, but mode: stream {NO_TRIGGER}")
             settings = settings.model_copy(update={"trigger": "external"})
-        self._settings, self._uncertified = permitted(settings)
-        settings = self._settings
+        settings, self._uncertified = permitted(settings)
+        self._settings = settings
         self._context = context
         self._clock = context.clock
         self._rf = context.motion.rf
