@@ -230,7 +230,7 @@ class GuardedCall:
     def abandon_if_late(self) -> Limit | None:
         """Abandon the call if a limit is reached, the innermost first; returns that limit."""
         now_s = time.monotonic()
-        with self._lock:
+        with self._lock:  # with `leave`: a part that has just ended in time must not be the late one
             late = next((limit for limit in reversed(self._limits) if now_s >= limit.deadline_s), None)
             self.is_abandoned = late is not None
         return late
@@ -429,7 +429,7 @@ class Guard:
                 if grace_s < math.inf and self._stop.is_set:
                     call.done.wait(grace_s)
                     if not call.done.is_set():
-                        self._stop.check()
+                        self._stop.check()  # does not raise while the request is held
                 late = call.abandon_if_late()
                 if late is not None:
                     raise _hung(late)

@@ -131,6 +131,7 @@ class Registry:
 
         Nothing of the plugin stays if the block fails.
         """
+        # one for each plugin, so that one that keeps it can be refused later
         registry = Registry(self._call)
         registry._owner, registry._entries, registry.contested = owner, self._entries, self.contested
         registry.used = self.used

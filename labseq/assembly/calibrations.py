@@ -90,7 +90,7 @@ def calibrated(
             problems.add(error)
             return ActiveCalibrations(entries, grid)
     for kind in CALIBRATION_KINDS:
-        with problems:
+        with problems:  # a damaged one must not keep the others from being checked
             if pins is None:
                 stored = _chosen(document, profile, store, kind)
             else:

@@ -141,7 +141,7 @@ def choice_of(
 
 def parallelism_of(chosen: ChosenPlugin, planner: Any, motion: MotionSpec) -> int:
     """Maximum number of mobile tweezers in a batch: the planner's own limit, else that of the motion."""
-    dop = call_plugin(
+    dop = call_plugin(  # a property of the planner may raise, too
         chosen.entry.owner,
         "its degree_of_parallelism",
         lambda: getattr(planner, "degree_of_parallelism", motion.max_tweezers),

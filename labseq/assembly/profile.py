@@ -236,6 +236,7 @@ def choose(
         ConfigError: Unknown name, a plugin that failed to load, or wrong settings, with their place.
     """
     kind = choice.role if isinstance(choice, DeviceChoice) else role
+    # not of a further camera among the devices, whose kind is a role, too
     by_line = kind == role and trigger_line(spec.line_specs, role) is not None
     if dry_run == "off" or not ROLES[kind].has_twin or choice.use == VIRTUAL_TWIN:
         chosen, warning = resolve(host, document, kind, choice), ""
@@ -254,6 +255,7 @@ def _in_dry_run(
         return (_twin(host, document, kind, choice) if elsewhere else chosen), ""
     if dry_run == "fast":
         return _twin(host, document, kind, choice), ""
+    # so that a sequence can be tried on a computer without the machine's drivers
     if absence := _absence(host, kind, choice.use):
         twin = _twin(host, document, kind, choice)
         return twin, f"{absence}; its virtual twin takes its place and its settings were not checked"

@@ -133,6 +133,7 @@ def find(root: Node, address: str, source: str = "", may_add: Collection[str] | 
             continue
         keys = _keys_of_part(node, part)
         child = node.at(keys) if keys else None
+        # a name in `devices` is one that the file gives: another one is a typing error
         new = i == len(parts) - 1 or (
             may_add is not None and (part in may_add if i == 0 else here not in NAMED)
         )

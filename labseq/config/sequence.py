@@ -335,6 +335,7 @@ def load_sequence(
     with collecting(problems) as collector:
         document = document.override_all(overrides, collector, may_add=("policy",)).evaluated()
         scan: Scan | None = None
+        # before the values of the file are checked: those of the first point take the place of some
         if document.data.get("scan") is None:
             _refuse_without_scan(document, collector)
         else:

@@ -95,7 +95,11 @@ class Follower:
             RecordingError: The log cannot be read.
         """
         for line in self._log.read():
-            self._advance(line.get("t_s"))
+            t_s: Any = line.get("t_s")
+            if type(t_s) in (int, float) and 0 <= t_s < 1e12:  # a damaged line must not move the time
+                # each part of a resumed run begins at 0
+                self._logged_s += t_s - self._line_s if t_s >= self._line_s else t_s
+                self._line_s = t_s
             name, values = line.get("event"), line.get("values")
             if isinstance(name, str) and isinstance(values, dict):
                 yield Event(str(line.get("t_utc", "")), self._logged_s, name, values)
@@ -137,12 +141,6 @@ class Follower:
             return self._taken[shot["shot_index"], shot["attempt"], shot["status"]].pop(0)
         except (KeyError, TypeError, IndexError):
             return None
-
-    def _advance(self, t_s: Any) -> None:
-        """Advance to the time of a line; each part of a resumed run begins at 0."""
-        if type(t_s) in (int, float) and 0 <= t_s < 1e12:  # a damaged line must not move the time
-            self._logged_s += t_s - self._line_s if t_s >= self._line_s else t_s
-            self._line_s = t_s
 
 
 def _inside(shot: Shot, end: Event) -> Iterator[Event]:

@@ -69,7 +69,8 @@ class RunWriter:
         self._events_lock = threading.Lock()
         self._n_events_lost = 0
         self._began_s = time.monotonic()
-        self._before: dict[str, Any] | None = None  # run.json, if another process began the run
+        # run.json, if another process began the run: its settings are those of the first shots
+        self._before: dict[str, Any] | None = None
         self._existing_files: frozenset[str] = frozenset()
 
     @classmethod

@@ -46,7 +46,7 @@ def lock_devices(
         for identity, role in hardware.identities.items():
             device = device_text(role, identity)
             lock = Lock(lock_file(identity), purpose)
-            while True:
+            while True:  # again once the process that held it has been ended
                 try:
                     make_shared(lock.path.parent)
                     holder = lock.take()

@@ -137,7 +137,7 @@ class CameraSeries:
 
     def taken(self, fired_s: float) -> None:
         """Count an image; ``fired_s`` is when the lines were fired for it, on the session's clock."""
-        if self.cycle_s:
+        if self.cycle_s:  # counted from the first edge, as the camera does: labseq's own delays do not add up
             self.fire_s = self.cycle_s + (fired_s if math.isnan(self.fire_s) else self.fire_s)
         self._n_left, self._n_taken = self._n_left - 1, self._n_taken + 1
         if self._is_lit_between:

@@ -39,6 +39,7 @@ def line_program(
     begin_s = max((spec.lead_s for spec in taking_part), default=0.0)
     end_s = begin_s + duration_s
     over_s = end_s + max((spec.lag_s for spec in taking_part if not spec.pulse_s), default=0.0)
+    # a pulse may outlast its step
     over_s = max([over_s, *(begin_s - spec.lead_s + spec.pulse_s for spec in taking_part if spec.pulse_s)])
     spans = [
         [

@@ -249,6 +249,7 @@ class Sequencer:
             _raise_first(make_safe(self.lab, self.guard, reopened))  # all of them before any is closed
             _raise_first(close_all(self.lab, self.guard, reopened))
             self._watchdog.forget(reopened)
+        # before they are opened: if one fails to, the new ones are those to make safe
         self.lab, self._steps, self._parameters = lab, steps, dict(parameters)
         self.guard.direct = lab.direct_calls
         if reopened:
@@ -338,7 +339,7 @@ class Sequencer:
         shot = RunningShot(self.lab, self.guard, record, self._events, self._timelines)
         failure: LabseqError | None = None
         then: Then | None = None
-        try:
+        try:  # what ends the run; within it, what the run goes on after
             try:
                 self.guard.run_shot(partial(self._perform, shot))
             except LabseqError as error:

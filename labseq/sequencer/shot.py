@@ -271,7 +271,7 @@ class RunningShot:
         Raises:
             OverBudgetError: It took longer than its budget, and its policy does not allow that.
         """
-        if not needs_image:
+        if not needs_image:  # else its moves follow from the frame, and events wait until they have begun
             self._events.release()
         self.in_step, self._image_name, self._kept = True, images or name, None
         self.stages.begin_step(number, name, policy)
@@ -289,6 +289,7 @@ class RunningShot:
             timed_by = ", ".join(dict.fromkeys(entry.timed_by.name for entry in entries))
             host_s = time.perf_counter() - host_start_s
             self.record.steps.append(StepTiming(number, name, timed_by, start_s, *durations, host_s))
+        # not after a failure: the sequencer asks for the policy of the step that failed
         self.stages.policy, self.in_step = NO_POLICY, False
 
     def record_duration(self, planned_s: float, achieved_s: float) -> None:

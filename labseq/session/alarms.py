@@ -50,6 +50,7 @@ class Latest:
     def add(self, n: float, n_of: int) -> float:
         """Add a shot; returns the share, or nan as long as there are not enough."""
         self._counts.append((n, n_of))
+        # as few shots as are enough: what was long before says little of the machine now
         while sum(count[1] for count in self._counts) - self._counts[0][1] >= self._least:
             self._counts.popleft()
         self.n, self.n_of = sum(n for n, _ in self._counts), sum(n_of for _, n_of in self._counts)

@@ -82,7 +82,7 @@ class Checks:
         self._load = CachingLoader()
         self._unseen = {check.value for check in checks if not check.value.startswith(RESULT_PREFIX)}
         self.left_open = -1, ""
-        for row in rows:
+        for row in rows:  # as if this process had taken them, so that means continue where they were
             self._unseen.clear()  # the warning was given then
             skipping = [message for check, message in self._look(row) if check.then == "skip_point"]
             self.left_open = row.shot, skipping[0] if skipping else ""  # earlier skips are recorded

@@ -35,6 +35,7 @@ class Observers:
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         """Pass an event on to every receiver."""
+        # the log first: neither a plugin nor a screen may keep an event out of it
         self._write(name, values)
         self._notify(name, values)
         self._show(name, values)

@@ -149,6 +149,7 @@ def _unit(assembly: Assembly, loc: Loc, *, of_profile: bool) -> str:
     """SI unit of a setting of a plugin or of the core; "" if it has none."""
     core = type(assembly.hardware.profile if of_profile else assembly.sequence)
     entry, n_keys = (_plugin_of_profile if of_profile else _plugin_of_sequence)(assembly, loc)
+    # a mapping of a plugin may hold keys of the core, such as `lines.channels`
     return (entry and si_unit_at(entry.settings_model, loc[n_keys:])) or si_unit_at(core, loc)
 
 

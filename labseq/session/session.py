@@ -368,6 +368,7 @@ class Session(PreparedRun):
         """Check the run and compile its kernels; returns the devices of the first shot, and warnings."""
         warnings = [str(problem) for problem in check(self, runs=True).warnings]
         # once more: what the check has rehearsed used up random numbers and the states of simulated devices
+        # those of other points, too: a kernel that is compiled between two shots would hold up the run
         points = {point.lab_key: point for point in self.points.known(self.history).values()}
         points.pop(first.lab_key, None)
         self.warm(lab := self.build_lab(first))
