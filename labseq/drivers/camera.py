@@ -115,7 +115,7 @@ class CameraDriver(Camera):
     def _take(self, timeout_s: float) -> ExposureResult | None:
         """Wait for what comes next of the series; None if nothing comes in time.
 
-        See :func:`labseq.drivers.wait_for`.
+        See :func:`labseq.plugin.wait_for`.
         """
 
     @abstractmethod

@@ -23,7 +23,7 @@ A plugin needs no other module of labseq, except :mod:`labseq.testing` in its te
 
 from __future__ import annotations
 
-from labseq.drivers import wait_for
+from labseq.drivers.waiting import wait_for
 from labseq.errors import (
     ConfigError,
     DeviceError,

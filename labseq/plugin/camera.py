@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
-from labseq.drivers import CameraDriver, Cooling, ExposureResult, Series, SimulatedSensor, settle
-from labseq.drivers.camera import check_step, nearest
+from labseq.drivers.camera import (
+    CameraDriver,
+    Cooling,
+    ExposureResult,
+    Series,
+    SimulatedSensor,
+    check_step,
+    nearest,
+    settle,
+)
 from labseq.drivers.settings import CameraSettings, OrientationSettings
 
 __all__ = [

@@ -54,6 +54,15 @@ def take_frame(
         else:
             arm()
         frame = call(name, limit_s + DRIVER_MARGIN_S, camera.read, limit_s)
+    return as_frame(name, frame)
+
+
+def as_frame(name: str, frame: object) -> Frame:
+    """What a camera's ``read()`` returned.
+
+    Raises:
+        DeviceError: It is something else than a frame.
+    """
     if not isinstance(frame, Frame):
         raise DeviceError(name, f"read() returned {type(frame).__name__}; expected a Frame")
     return frame

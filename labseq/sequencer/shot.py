@@ -38,7 +38,7 @@ from labseq.model.policies import NO_POLICY, StepPolicy
 from labseq.model.records import OVERSHOOT_S, STEP, LineEdge
 from labseq.realtime import raise_priority, restore_priority
 from labseq.roles import Device, Hardware, ReportsSignals, RunObserver, StepContext, overrides
-from labseq.sequencer.images import CameraSeries, take_frame
+from labseq.sequencer.images import CameraSeries, as_frame, take_frame
 from labseq.sequencer.lab import Lab, check_blinding
 from labseq.sequencer.leader import Emit, LeaderAnswers
 from labseq.sequencer.lines import line_program, margin_s, trigger_line
@@ -467,15 +467,14 @@ class RunningShot:
         if self.series.is_ready(exposure_s):
             self._await_exposure()
         timeout_s, start_s = self.call_timeout_s, self.elapsed_s
-        frame = self._expose(exposure_s, cycle)
+        answer = self._expose(exposure_s, cycle)
         self._catch_up()
         self._frame_s = self.clock.now(), time.perf_counter()
         self._events.hold()
-        if not isinstance(frame, Frame):  # pyright: ignore[reportUnnecessaryIsInstance]
-            raise DeviceError("camera", f"read() returned {type(frame).__name__}; expected a Frame")
+        frame = as_frame("camera", answer)
         with self.stage("detect", cycle=cycle):
-            answer = self.call("detector", timeout_s, self.lab.detector.detect, frame)
-        occupancy, confidence, signal = self._detected(answer)
+            detected = self.call("detector", timeout_s, self.lab.detector.detect, frame)
+        occupancy, confidence, signal = self._detected(detected)
         self.occupancy, self.frame = occupancy, frame
         name = self._name_of_image(cycle)
         image = ImageRecord(frame, occupancy, confidence, self.step, cycle, start_s, exposure_s, name, signal)
