@@ -29,7 +29,7 @@ from labseq.data.export import check_export
 from labseq.errors import LabseqError
 from labseq.model import ScanSpace
 from labseq.pictures.figures import check_place
-from labseq.recording.hdf5 import load_filter
+from labseq.recording.read_hdf5 import load_filter
 from labseq.web.serve import check_packages
 from labseq.wire import require_packages
 

@@ -30,17 +30,9 @@ from labseq.errors import RecordingError
 from labseq.files import read_file, whole_file
 from labseq.plain import plain_text
 from labseq.recording import folders, schema
-from labseq.recording.hdf5 import (
-    check_attributes,
-    copy_attributes,
-    link_name,
-    load_filter,
-    read_attribute,
-    read_attributes,
-    set_attributes,
-    text_array,
-)
+from labseq.recording.read_hdf5 import check_attributes, load_filter, read_attribute, read_attributes
 from labseq.recording.shot_file import content_of, open_finished, opened
+from labseq.recording.write_hdf5 import add_attribute, link_name, set_attributes, text_array
 
 FORMAT: Final = "labseq-archive"
 FORMAT_VERSION: Final = "4.0"
@@ -140,7 +132,7 @@ class _Shots:
             for camera in entry.get("camera", {}).values() if self._frames else ():
                 load_filter(shot.file, camera["frames"])
             copy = self._group.create_group(shot.file.stem)
-            copy_attributes(entry, copy)
+            _copy_attributes(entry, copy)
             for name in entry:
                 if name in ("target", "run"):
                     self._share(entry[name], copy, name)
@@ -213,7 +205,7 @@ def _copy(source: Any, copy: Any, name: str, *, frames: bool) -> None:
     node = source[name]
     if isinstance(node, h5py.Group):
         group = copy.create_group(name)
-        copy_attributes(node, group)
+        _copy_attributes(node, group)
         for inner in node.keys():  # noqa: SIM118 - the names in this group, all text
             _copy(node, group, inner, frames=frames)
         return
@@ -225,6 +217,12 @@ def _copy(source: Any, copy: Any, name: str, *, frames: bool) -> None:
     if node.dtype.kind != "O" and (node.nbytes >= 1024 or is_compressed):
         chunks = (1, *node.shape[1:]) if is_image else True  # one frame is read without its neighbours
         packing = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
-        copy_attributes(node, copy.create_dataset(name, data=node[()], chunks=chunks, **packing))
+        _copy_attributes(node, copy.create_dataset(name, data=node[()], chunks=chunks, **packing))
     else:
         source.file.copy(node, copy, name)
+
+
+def _copy_attributes(source: Any, goal: Any) -> None:
+    """Copy the attributes of a group or dataset."""
+    for name, array in read_attributes(source).items():
+        add_attribute(goal, name, array)

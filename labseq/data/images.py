@@ -63,7 +63,7 @@ def signals_of(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, Floats, s
     Raises:
         RecordingError: No shot has them, or files are damaged.
     """
-    from labseq.recording.hdf5 import read_attribute  # h5py takes 0.1 s to import
+    from labseq.recording.read_hdf5 import read_attribute  # h5py takes 0.1 s to import
 
     signals, thresholds, unit = list[Any](), list[Any](), ""
     for entry, index in _entries(shots, image):

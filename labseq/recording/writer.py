@@ -28,7 +28,7 @@ from labseq.recording.index import IndexRow, row_of_record
 from labseq.recording.run_file import encode_run, encode_state, encode_text, read_run
 
 if TYPE_CHECKING:
-    from labseq.recording.shot_file import ShotEncoder
+    from labseq.recording.shot_encoder import ShotEncoder
 
 
 P = ParamSpec("P")
@@ -172,7 +172,7 @@ class RunWriter:
         write_file(self.run_dir / folders.RUN_FILE, data)
 
     def _make_encoder(self) -> ShotEncoder:
-        from labseq.recording.shot_file import ShotEncoder  # h5py takes 0.1 s to import
+        from labseq.recording.shot_encoder import ShotEncoder  # h5py takes 0.1 s to import
 
         return ShotEncoder(self.run, run_id_of(self.run_dir))
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from labseq.recording import contents, schema
-from labseq.recording.shot_file import ShotEncoder
+from labseq.recording.shot_encoder import ShotEncoder
 
 from .records import make_run, make_shot
 

@@ -16,7 +16,8 @@ import pytest
 from labseq.errors import RecordingError
 from labseq.model import Frame
 from labseq.recording import schema
-from labseq.recording.shot_file import ShotEncoder, read_content
+from labseq.recording.shot_encoder import ShotEncoder
+from labseq.recording.shot_file import read_content
 
 from .records import make_run, make_shot
 
