@@ -1,0 +1,120 @@
+"""Explains the faults that the check of a plan finds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, NoReturn
+
+from labseq.errors import InvalidPlanError
+from labseq.model import MotionSpec, Plan, SiteGrid
+from labseq.motion import check_kernels, path_kernels
+from labseq.motion.axes import AXES
+from labseq.motion.tones import path_geometry
+from labseq.units import format_quantity
+
+FAULTS: Final[Mapping[str, tuple[str, str]]] = {
+    "EMPTY_BATCH": ("shape", "it has no atom moves; leave it out"),
+    "SOURCE_OUTSIDE": ("grid", "the source {site} lies outside of the grid of {n_rows} x {n_cols} sites"),
+    "GOAL_OUTSIDE": ("grid", "the goal {site} is neither on the grid nor within {slots} site(s) of its edge"),
+    "DIAGONAL": ("straight", "{source} -> {goal} changes row and column; split it into two linked batches"),
+    "NO_LENGTH": ("straight", "{source} -> {goal} goes nowhere; only in linked batches may an atom wait"),
+    "TWO_AXES": ("straight", "atom move {a} follows a row, {b} a column, so their crossing goes diagonally"),
+    "LINKED_FIRST": ("linked", "the first batch has none before it to be linked to"),
+    "LINKED_AFTER_EJECTION": ("linked", "the batch before it ejects, and tweezers ramp down there"),
+    "LINKED_NUMBER": ("linked", "it moves {a} atoms while {b} are held from the batch before"),
+    "LINKED_ELSEWHERE": ("linked", "its source {site} is not a goal of the batch before"),
+    "NO_ATOM": ("source", "there is no atom on {site}"),
+    "SOURCE_TWICE": ("source", "another atom move of the batch starts from {site} too"),
+    "GOAL_TAKEN": ("goal", "{source} -> {goal} ends on an atom that stays there"),
+    "GOAL_TWICE": ("goal", "another atom move of the batch ends on {site} too"),
+    "ROW_TONE_SPLIT": ("tones", "{source} -> {goal}, but the tone of row {a} goes to row {b}"),
+    "COLUMN_TONE_SPLIT": ("tones", "{source} -> {goal}, but the tone of column {a} goes to column {b}"),
+    "ROW_TONES": ("tones", "it needs {a} row tones; the limit is {b}"),
+    "COLUMN_TONES": ("tones", "it needs {a} column tones; the limit is {b}"),
+    "ROW_ORDER": ("order", "the tones of rows {a} and {b} meet or pass each other"),
+    "COLUMN_ORDER": ("order", "the tones of columns {a} and {b} meet or pass each other"),
+    "TWEEZERS": (
+        "parallelism",
+        "{a} row x {b} column tones make {n_tweezers} tweezers; the limit is {limit}",
+    ),
+    "CROSSING_ON_ATOM": ("crossing", "its tones cross on the atom on {site} too, which it does not name"),
+    "PATH_OVER_ATOM": ("path", "its tones cross the atom that stands on {site} on their way or at its end"),
+    "LINKED_AFTER_PATHS": (
+        "linked",
+        "it or the batch before has paths of tones; only line batches are linked",
+    ),
+    "PATH_SHAPE": ("tones", "its paths have fewer than two knots, or an axis has no tone"),
+    "PATH_POSITION": ("tones", "a position of {axis} tone {b} is not finite"),
+    "PATH_OFF": (
+        "tones",
+        "{axis} tones go off at knots from 1 to the last, one at the last; not so tone {b}",
+    ),
+    "PATH_OUTSIDE": ("grid", "{axis} tone {b} goes further than {slots} site(s) beyond the grid's edge"),
+    "PATH_ORDER": (
+        "order",
+        "{axis} tone {b} comes closer than {least} sites to the one before, or passes it",
+    ),
+    "PATH_NO_TONE": ("tones", "no {axis} tone starts at {source}"),
+    "PATH_END": (
+        "tones",
+        "{source} -> {goal}, but its {axis} tone is elsewhere at knot {b}, where it is let go",
+    ),
+    "PATH_PICKS_UP": (
+        "crossing",
+        "a tweezer that it does not name comes on at the atom on {site} or too near to it",
+    ),
+    "PATH_NEAR_ATOM": ("path", "a tweezer comes closer than {clearance} to the atom that stands on {site}"),
+    "PATH_LANDS": (
+        "path",
+        "a tweezer without an atom ends on the atom on {site}, and empty_tweezers_may_land is off",
+    ),
+    "INNER_EJECTION": ("ejection", "an atom would be ejected over the one on {site}; eject that one first"),
+}
+"""Faults of :mod:`labseq.motion.check_kernels`: name -> rule, wording."""
+_AT_A_SITE: Final = {"INNER_EJECTION", *(name for name, (_, text) in FAULTS.items() if "{site}" in text)}
+"""The faults whose two numbers are a site."""
+
+
+def raise_plan_error(
+    fault: int,
+    fault_place: list[int],
+    plan: Plan,
+    grid: SiteGrid,
+    max_tweezers: int,
+    motion: MotionSpec,
+    planner: str,
+) -> NoReturn:
+    """Raise the error for a fault.
+
+    Args:
+        fault: Its number, as the kernels of the check give it.
+        fault_place: Its batch and atom move, or -1; and two numbers whose meaning depends on the fault.
+        plan: The plan.
+        grid: The grid of sites.
+        max_tweezers: Most tweezers on at once.
+        motion: How the tweezers move.
+        planner: Name of the planner, or "".
+    """
+    batch, move, a, b = (int(number) for number in fault_place)
+    name = next(name for name in FAULTS if (vars(path_kernels) | vars(check_kernels)).get(name) == fault)
+    rule, wording = FAULTS[name]
+    row = col = to_row = to_col = -1  # only used in messages about an atom move
+    if move >= 0:
+        row, col, to_row, to_col = plan.moves[plan.batch_offsets[batch] + move].tolist()
+    detail = wording.format(
+        source=(row, col),
+        goal=(to_row, to_col),
+        site=(a, b),
+        a=a,
+        b=b,
+        n_tweezers=a * b,
+        limit=max_tweezers,
+        n_rows=grid.n_rows,
+        n_cols=grid.n_cols,
+        slots=motion.eject_slots,
+        axis=AXES[a] if a in (0, 1) else "",
+        least=f"{path_geometry(grid, motion)[2]:.3g}",
+        clearance=format_quantity(motion.clearance_m, "length"),
+    )
+    site = (a, b) if name in _AT_A_SITE else None
+    raise InvalidPlanError(rule, detail, batch=batch, move=move, planner=planner, site=site)
