@@ -229,11 +229,15 @@ class SequenceReplay(PlayMode):
             start_s = time.perf_counter()
             renderer.write(part.start, frames)
             self.render_s += time.perf_counter() - start_s
-            if on_the_way is not None:
+            if on_the_way is None:
+                self._send(part.number + 1, frames)
+            else:
+                self._arrive(on_the_way)
+                self._send(part.number + 1, frames)  # before the steps are written: the bus is not left idle
                 self._link(on_the_way)
-            self._send(part.number + 1, frames)
             on_the_way = part
         if on_the_way is not None:
+            self._arrive(on_the_way)
             self._link(on_the_way)
 
     def _send(self, segment: int, frames: NDArray[np.int16]) -> None:
@@ -243,11 +247,14 @@ class SequenceReplay(PlayMode):
         card.set(spcm.SPC_SEQMODE_SEGMENTSIZE, len(frames), "size of the segment")
         card.begin_upload(frames)
 
-    def _link(self, part: Part) -> None:
-        """Wait until a part has arrived, and write its steps; the last one before a joint is linked."""
+    def _arrive(self, part: Part) -> None:
+        """Wait until a part has arrived."""
         self._card.finish_upload(FRAME_BYTES * (part.stop - part.start), POLL_S)
         if not self._is_on:
             raise DeviceError(self._card.name, "stopped by safe_state() while a program was uploaded")
+
+    def _link(self, part: Part) -> None:
+        """Write the steps of a part that has arrived; the last one before a joint is linked."""
         plays, waits = self._first + 2 * part.number, self._first + 2 * part.number + 1
         if not part.is_last:
             self._write_step(plays, part.number + 1, plays + 2)
