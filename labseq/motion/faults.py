@@ -1,14 +1,15 @@
-"""Explains the faults that the check of a plan finds."""
+"""Explains the faults that the checks of a plan and of its tones find."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Final, NoReturn
 
-from labseq.errors import InvalidPlanError
-from labseq.model import MotionSpec, Plan, SiteGrid
+from labseq.errors import InvalidPlanError, LimitError
+from labseq.model import MotionSpec, Plan, RfSpec, SiteGrid
 from labseq.motion import check_kernels, path_kernels
-from labseq.motion.axes import AXES
+from labseq.motion.axes import AXES, AxisIndex
+from labseq.motion.tone_kernels import AMPLITUDES, BAND, SPACING
 from labseq.motion.tones import path_geometry
 from labseq.units import format_quantity
 
@@ -118,3 +119,51 @@ def raise_plan_error(
     )
     site = (a, b) if name in _AT_A_SITE else None
     raise InvalidPlanError(rule, detail, batch=batch, move=move, planner=planner, site=site)
+
+
+def raise_limit_error(
+    fault: int, value: float, axis: AxisIndex, tone: int, n_tones: int, batch: int, rf: RfSpec
+) -> NoReturn:
+    """Raise the error for an exceeded limit.
+
+    Args:
+        fault: Which limit, as ``first_excess`` of the kernels gives it.
+        value: What exceeds it: a frequency or distance in Hz, a sum of amplitudes or of their squares.
+        axis: 0 for the rows' tones, 1 for the columns'.
+        tone: The tone, from 0 in its segment.
+        n_tones: Number of tones of the segment.
+        batch: Its batch.
+        rf: The limits in the words of the profile.
+    """
+    name = AXES[axis]
+    frequency, rf_settings = ("grid", f"{name}_frequency"), ("mobile_tweezers", "rf")
+    in_batch = f"in batch {batch}"
+    all_tones = f"{name} tones 0 to {n_tones - 1} {in_batch}" if n_tones > 1 else f"{name} tone 0 {in_batch}"
+    if fault == BAND:
+        low, high = (f"{hz / 1e6:.6g}" for hz in (rf.row_band_hz, rf.column_band_hz)[axis])
+        quantity = f"the frequency of {name} tone {tone} {in_batch}"
+        limit = f"the band of {low} to {high} MHz"
+        raise LimitError(quantity, f"{value / 1e6:.6g} MHz", limit, setting=frequency)
+    if fault == SPACING:
+        quantity = f"the distance of {name} tones {tone - 1} and {tone} {in_batch}"
+        least = format_quantity(rf.min_spacing_hz, "frequency")
+        raise LimitError(
+            quantity,
+            f"{value / 1e6:.6g} MHz",
+            f"{least} at least, in the order of the sites",
+            setting=frequency,
+        )
+    if fault == AMPLITUDES and rf.full_scale_v > rf.max_peak_v:
+        quantity = f"the peak voltage of {all_tones}"
+        amount = format_quantity(value * rf.full_scale_v, "voltage")
+        limit = f"{format_quantity(rf.max_peak_v, 'voltage')}: more ruins the amplifier"
+        raise LimitError(quantity, amount, limit, setting=rf_settings)
+    if fault == AMPLITUDES:
+        quantity = f"the sum of the amplitudes of {all_tones}"
+        raise LimitError(
+            quantity, f"{value:.6g} of full scale", "1: the output would clip", setting=rf_settings
+        )
+    power_w = value * rf.full_scale_power_w
+    limit = f"{format_quantity(rf.max_mean_power_w, 'power')} at the AOD"
+    quantity = f"the mean RF power of {all_tones}"
+    raise LimitError(quantity, format_quantity(power_w, "power"), limit, setting=rf_settings)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Final, NoReturn, get_args
+from typing import Final, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from labseq.errors import LimitError, PlanError
 from labseq.model import AxisTones, MotionSpec, Plan, PlanReport, RfSpec, SiteGrid, ToneProgram
 from labseq.model.motion import SpeedProfile
 from labseq.motion.axes import AXES, AxisIndex, Drive, drive
-from labseq.units import format_quantity
 
 AXIS_INDICES: Final[tuple[AxisIndex, AxisIndex]] = (0, 1)
 """Index of the row tones, index of the column tones."""
@@ -221,46 +220,8 @@ def check_limits(
         raise LimitError(quantity, n_tones[worst], drive.max_tones)
     fault, tone, value = first_excess(offsets, values, drive.limits)
     if fault != WITHIN:
+        from labseq.motion.faults import raise_limit_error  # tones within their limits need no explanation
+
         segment = int(np.searchsorted(offsets, tone, side="right")) - 1
         first, last = (int(n) for n in offsets[segment : segment + 2])
-        _raise_limit_error(fault, value, axis, tone - first, last - first, int(batch[segment]), rf)
-
-
-def _raise_limit_error(
-    fault: int, value: float, axis: AxisIndex, tone: int, n_tones: int, batch: int, rf: RfSpec
-) -> NoReturn:
-    """Raise the error for an exceeded limit."""
-    from labseq.motion.tone_kernels import AMPLITUDES, BAND, SPACING
-
-    name = AXES[axis]
-    frequency, rf_settings = ("grid", f"{name}_frequency"), ("mobile_tweezers", "rf")
-    in_batch = f"in batch {batch}"
-    all_tones = f"{name} tones 0 to {n_tones - 1} {in_batch}" if n_tones > 1 else f"{name} tone 0 {in_batch}"
-    if fault == BAND:
-        low, high = (f"{hz / 1e6:.6g}" for hz in (rf.row_band_hz, rf.column_band_hz)[axis])
-        quantity = f"the frequency of {name} tone {tone} {in_batch}"
-        limit = f"the band of {low} to {high} MHz"
-        raise LimitError(quantity, f"{value / 1e6:.6g} MHz", limit, setting=frequency)
-    if fault == SPACING:
-        quantity = f"the distance of {name} tones {tone - 1} and {tone} {in_batch}"
-        least = format_quantity(rf.min_spacing_hz, "frequency")
-        raise LimitError(
-            quantity,
-            f"{value / 1e6:.6g} MHz",
-            f"{least} at least, in the order of the sites",
-            setting=frequency,
-        )
-    if fault == AMPLITUDES and rf.full_scale_v > rf.max_peak_v:
-        quantity = f"the peak voltage of {all_tones}"
-        amount = format_quantity(value * rf.full_scale_v, "voltage")
-        limit = f"{format_quantity(rf.max_peak_v, 'voltage')}: more ruins the amplifier"
-        raise LimitError(quantity, amount, limit, setting=rf_settings)
-    if fault == AMPLITUDES:
-        quantity = f"the sum of the amplitudes of {all_tones}"
-        raise LimitError(
-            quantity, f"{value:.6g} of full scale", "1: the output would clip", setting=rf_settings
-        )
-    power_w = value * rf.full_scale_power_w
-    limit = f"{format_quantity(rf.max_mean_power_w, 'power')} at the AOD"
-    quantity = f"the mean RF power of {all_tones}"
-    raise LimitError(quantity, format_quantity(power_w, "power"), limit, setting=rf_settings)
+        raise_limit_error(fault, value, axis, tone - first, last - first, int(batch[segment]), rf)
