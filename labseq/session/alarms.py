@@ -66,13 +66,12 @@ class Alarms:
     """Looks at each shot of a run.
 
     Args:
-        settings: The limits; None for no alarms.
+        settings: The limits.
         warn: Receives its name and a message when an alarm begins.
     """
 
-    def __init__(self, settings: AlarmSettings | None, warn: Callable[[str, str], None]) -> None:
-        self._settings = settings or AlarmSettings()
-        self._is_on = settings is not None
+    def __init__(self, settings: AlarmSettings, warn: Callable[[str, str], None]) -> None:
+        self._settings = settings
         self._warn = warn
         self._in_a_row: dict[str, int] = {}
         self._texts: dict[str, str] = {}
@@ -84,7 +83,7 @@ class Alarms:
 
     def look(self, shot: ShotRecord) -> None:
         """Look at a shot that was taken; attempts that did not complete are left out."""
-        if shot.status != "complete" or not self._is_on:
+        if shot.status != "complete":
             return
         found = dict(self._signs(shot))
         self._in_a_row = {name: self._in_a_row.get(name, 0) + 1 for name in found}

@@ -38,9 +38,7 @@ class History:
         given_up: Number of a point -> a shot that was given up there; likewise.
     """
 
-    def __init__(
-        self, assembly: Assembly, seed: int, run: Run | None = None, done: Collection[int] = ()
-    ) -> None:
+    def __init__(self, assembly: Assembly, seed: int, run: Run | None, done: Collection[int]) -> None:
         self.point_of_shot = assembly.point_of_shot(seed)
         self.to_take = [shot for shot in range(len(self.point_of_shot)) if shot not in done]
         self.last: int | None = None
@@ -122,7 +120,7 @@ class PreparedRun:
         paced: Let virtual time pass at the speed of real time.
         observer: Receives every event.
         root: The folder for the data.
-        run: The run as it was before, if it is resumed.
+        run: The run as it was before, if it is resumed; else None.
         done: Its shots that are not taken again.
 
     Attributes:
@@ -139,12 +137,12 @@ class PreparedRun:
     def __init__(
         self,
         assembly: Assembly,
-        observer: RunObserver | None = None,
+        observer: RunObserver | None,
         *,
-        paced: bool = False,
+        paced: bool,
         root: Path,
-        run: Run | None = None,
-        done: Collection[int] = (),
+        run: Run | None,
+        done: Collection[int],
     ) -> None:
         self.assembly = assembly
         self.root = root.absolute()  # some vendors' libraries change the working folder

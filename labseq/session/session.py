@@ -78,8 +78,8 @@ class Shots:
         self._point = first
         self._writer = writer
         assembly = run.assembly
-        limits = assembly.hardware.profile.alarms if assembly.sequence.alarms else None
-        self._alarms = Alarms(limits, self._warn_of)
+        self._gives_alarms = assembly.sequence.alarms
+        self._alarms = Alarms(assembly.hardware.profile.alarms, self._warn_of)
         self._clock_jumps = ClockJumps()
         self.sequencer = Sequencer(
             lab,
@@ -103,7 +103,8 @@ class Shots:
             about = {"shot": shot.shot_index, "attempt": shot.attempt}
             self._run.observers.event("clock_jumped", {**about, **jumps})
         row = self._writer.write_shot(shot)
-        self._alarms.look(shot)
+        if self._gives_alarms:
+            self._alarms.look(shot)
         return row
 
     def take_all(self, checks: Checks, precision: Precision | None) -> None:
@@ -180,7 +181,7 @@ class Session(PreparedRun):
         self,
         assembly: Assembly,
         options: Options,
-        observer: RunObserver | None = None,
+        observer: RunObserver | None,
         earlier: ResumableRun | None = None,
         warnings: Sequence[str] = (),
     ) -> None:
