@@ -319,12 +319,19 @@ class Store:
             ConfigError: It is missing or damaged, or ``active.json`` is damaged.
         """
         active = self.active().get(kind)
-        if active is None:
-            return None
+        return None if active is None else self.entry_of(active)
+
+    def entry_of(self, active: Activation) -> Stored:
+        """The entry that was put to use.
+
+        Raises:
+            ConfigError: It is missing, damaged, or another one than then.
+        """
         path = self.folder / active.file
         entry = read_entry(path)
-        if (entry.kind, entry.id) != (kind, active.id):
-            raise damaged(path, f"{active.id} was put to use as '{kind}', and this is another calibration")
+        if (entry.kind, entry.id) != (active.kind, active.id):
+            fault = f"{active.id} was put to use as '{active.kind}', and this is another calibration"
+            raise damaged(path, fault)
         return Stored(entry, path)
 
     def use(self, stored: Stored, grid: SiteGrid) -> None:

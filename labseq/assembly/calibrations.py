@@ -8,7 +8,7 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from labseq.calibration_store import Store, Stored, check_grid
+from labseq.calibration_store import Activation, Store, Stored, check_grid
 from labseq.config.document import Document
 from labseq.config.profile import OFF, ProfileSpec, load_profile
 from labseq.errors import ConfigError, LimitError, ProblemCollector
@@ -83,16 +83,17 @@ def calibrated(
     """
     grid, store = profile.grid_model(), store_of(document, profile, dry_run)
     entries: dict[str, CalibrationEntry] = {}
+    active: Mapping[str, Activation] = {}
     if pins is None and any(profile.calibrations.use.of(kind) is None for kind in CALIBRATION_KINDS):
         try:
-            store.active()
+            active = store.active()
         except ConfigError as error:  # reported once, not for each kind
             problems.add(error)
             return ActiveCalibrations(entries, grid)
     for kind in CALIBRATION_KINDS:
         with problems:  # a damaged one must not keep the others from being checked
             if pins is None:
-                stored = _chosen(document, profile, store, kind)
+                stored = _chosen(document, profile, store, kind, active.get(kind))
             else:
                 stored = store.find(pins[kind], kind) if kind in pins else None
             if stored is not None:
@@ -128,8 +129,14 @@ def with_calibrations(motion: MotionSpec, entries: Mapping[str, CalibrationEntry
     return replace(motion, rf=replace(motion.rf, row_amplitudes=rows, column_amplitudes=columns))
 
 
-def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: CalibrationKind) -> Stored | None:
-    """The entry of a kind that the profile uses.
+def _chosen(
+    document: Document,
+    profile: ProfileSpec,
+    store: Store,
+    kind: CalibrationKind,
+    active: Activation | None,
+) -> Stored | None:
+    """The entry of a kind that the profile uses; ``active`` is what the store has in use.
 
     Raises:
         ConfigError: It is missing or damaged.
@@ -138,7 +145,9 @@ def _chosen(document: Document, profile: ProfileSpec, store: Store, kind: Calibr
     if pin == OFF:
         return None
     try:
-        return store.entry_in_use(kind) if pin is None else store.find(pin, kind)
+        if pin is not None:
+            return store.find(pin, kind)
+        return None if active is None else store.entry_of(active)
     except ConfigError as error:
         where = document.problem(("calibrations", "use", kind), "").source
         note = (

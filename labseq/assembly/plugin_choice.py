@@ -90,12 +90,13 @@ def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> 
         ConfigError: Unknown name, a plugin that failed to load, or wrong settings, with file, line
             and column.
     """
-    entry = find_entry(host, document, kind, choice.use, (*choice.loc, choice.key))
+    loc = choice.loc
+    entry = find_entry(host, document, kind, choice.use, (*loc, choice.key))
     try:
-        settings = read_settings(document, entry, choice.loc, choice.core_keys)
+        settings = read_settings(document, entry, loc, choice.core_keys)
     except ConfigError as error:
         raise _with_advice(error, document, choice) from None
-    return ChosenPlugin(entry, settings, document, choice.loc)
+    return ChosenPlugin(entry, settings, document, loc)
 
 
 def _with_advice(error: ConfigError, document: Document, choice: Choice) -> ConfigError:
