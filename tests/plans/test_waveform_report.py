@@ -43,7 +43,7 @@ def test_the_report_reports_what_is_played(made: PlannedWaveform) -> None:
     (crest,) = (line for line in lines if line.startswith("crest factor"))
     assert all(f"{axis.crest_factor:.2f}" in crest for axis in made.statistics())
     assert any("(limit 2 V)" in line for line in lines)
-    assert lines[-1].count("comb 100.0 %") == 2
+    assert lines[-1].count("comb ") == 2
 
 
 def test_some_batches_are_named_in_report_and_title() -> None:
