@@ -195,16 +195,19 @@ def _assembled(
     with problems:
         planner = resolve(hardware.host, document, "planner", sequence.planner)
     steps, step_dumps = make_steps(hardware, document, sequence, problems)
+    all_steps = steps if len(steps) == len(sequence.shot) else None
     analyses, results = make_analyses(hardware, document, sequence, problems)
     if sequence.measure or sequence.policy.checks or sequence.scan:
         from labseq.assembly.quantities import readings_of  # loads what other runs do not need
 
-        is_known = is_whole and len(steps) == len(sequence.shot)
+        is_known = is_whole and all_steps is not None
         results = [*results, *readings_of(hardware, steps, is_whole=is_known)]
     # quantities may name regions, which a file with errors may have lost
-    regions_of = target if is_whole else None
-    policy, policy_dumps = make_policy(document, sequence, steps, results, regions_of, problems)
-    measures = make_measures(document, sequence, steps, regions_of, results, scan, hardware.host, problems)
+    whole_target = target if is_whole else None
+    policy, policy_dumps = make_policy(document, sequence, all_steps, results, whole_target, problems)
+    measures = make_measures(
+        document, sequence, all_steps, whole_target, results, scan, hardware.host, problems
+    )
     scanned: ScanPoints | None = None
     search: Search | None = None
     if scan is not None and is_whole:
@@ -365,17 +368,23 @@ def make_analyses(
 def make_policy(
     document: Document,
     sequence: SequenceSpec,
-    steps: Sequence[tuple[str, Step]],
+    steps: Sequence[tuple[str, Step]] | None,
     results: Collection[str],
     target: TargetPattern | None,
     problems: ProblemCollector,
 ) -> tuple[RunPolicy, list[dict[str, Any]]]:
-    """The policies of a run and its steps, and for the record of each step the ``policy`` that it has."""
+    """The policies of a run and its steps, and for the record of each step the ``policy`` that it has.
+
+    Args:
+        steps: The steps of a shot; None if some have errors.
+        results: Names of the results of the analyses.
+        target: The target; None if it has errors.
+        problems: Receives those of the policies, and of the quantities that they check.
+    """
     settings = sequence.policy
     otherwise = StepPolicy(on_failure=settings.on_failure, over_budget=settings.over_budget)
     policies = [NO_POLICY] * len(sequence.shot)
     dumps: list[dict[str, Any]] = [{} for _ in sequence.shot]
-    is_whole = len(steps) == len(sequence.shot)
     for number, spec in enumerate(sequence.shot):
         loc = spec.policy_loc
         with problems:
@@ -389,21 +398,21 @@ def make_policy(
                 keys = document.get(loc) or {}
                 written = [setting for setting in settings_of(StepPolicy) if setting.key in keys]
                 dumps[number] = {"policy": {one.key: getattr(own, one.name) for one in written}}
-            if is_whole and own.retries and not steps[number][1].repeatable:
+            if steps is not None and own.retries and not steps[number][1].repeatable:
                 what = f"'{spec.kind}' cannot be tried again in the same shot: atoms may have moved"
                 hint = "write 'on_failure: repeat_shot'"
                 raise document.error((*loc, "retries"), what, "0", hint, key=True)
     if settings.checks:
         from labseq.assembly.quantities import check_checks  # loads what a run without checks does not need
 
-        check_checks(document, sequence, steps if is_whole else None, results, target, problems)
+        check_checks(document, sequence, steps, results, target, problems)
     return RunPolicy(sequence.attempts, settings.when_exhausted, otherwise, tuple(policies)), dumps
 
 
 def make_measures(
     document: Document,
     sequence: SequenceSpec,
-    steps: Sequence[tuple[str, Step]],
+    steps: Sequence[tuple[str, Step]] | None,
     target: TargetPattern | None,
     results: Collection[str],
     scan: Scan | None,
@@ -413,18 +422,17 @@ def make_measures(
     """The quantities that a run measures, JSON-ready: as its sequence says, or chosen by its steps.
 
     Args:
-        steps: The steps of a shot; fewer than in the sequence if some have errors.
+        steps: The steps of a shot; None if some have errors.
         target: The target; None if it has errors.
         results: Names of the results of the analyses.
         scan: The scan; None without one, or if it has errors.
         host: The plugins, which may offer models to fit.
         problems: Receives those of names, fits and parameters.
     """
-    checked = steps if len(steps) == len(sequence.shot) else None
     if sequence.measure is None:
         summaries = [
             StepSummary(name, step.takes_image, spec.kind == "load")
-            for spec, (name, step) in zip(sequence.shot, checked or (), strict=False)
+            for spec, (name, step) in zip(sequence.shot, steps or (), strict=False)
         ]
         has_target = target is not None and not target.is_none
         return [{"value": name} for name in measured_by_default(summaries, has_target=has_target)]
@@ -433,7 +441,7 @@ def make_measures(
     for number, measure in enumerate(sequence.measure):
         with problems:
             place = ("measure", number, "value")
-            check_quantity(document, place, measure.value, "to measure", checked, results, target)
+            check_quantity(document, place, measure.value, "to measure", steps, results, target)
             if measure.fit is not None:
                 from labseq.assembly.fits import check_fit  # most runs fit nothing
 
