@@ -102,7 +102,7 @@ def test_a_run_that_is_stopped_tells_its_leader_why(tmp_path: Path) -> None:
 
     with pytest.raises(StopRequested):
         run_led(lead, tmp_path, stop_at="image")
-    assert said == ["hello labseq 2 deadline=60", "busy", "failed shot=0 reason=stopped by Ctrl-C", ""]
+    assert said == ["hello labseq 3 deadline=60", "busy", "failed shot=0 reason=stopped by Ctrl-C", ""]
 
 
 def test_a_shot_that_fails_tells_its_leader_why(tmp_path: Path) -> None:
