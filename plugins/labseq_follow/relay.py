@@ -7,6 +7,7 @@ answers `go` with a line that the run has given it in advance. It imports the st
 
 from __future__ import annotations
 
+import os
 import select
 import signal
 import socket
@@ -106,6 +107,10 @@ def _relay(run: socket.socket, leader: socket.socket) -> None:
 def main(fileno: int) -> None:
     """Wait for the control system's socket, then serve it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        with suppress(OSError):  # the system does not allow it; then other programs may delay the answer
+            # above all ordinary programs, and below the thread of a shot's steps, which has 20
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
     with socket.socket(fileno=fileno) as run:
         _, fds, _, _ = socket.recv_fds(run, 1, 1)
         if fds:

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from labseq_follow.leader import LeaderDevice, serial_leader
+from labseq_follow.relay import can_relay
 from labseq_follow.settings import SerialLeaderSettings
 from labseq_follow.tcp import MAX_NEWCOMERS
 
@@ -137,6 +138,42 @@ def test_a_token_that_goes_on_is_refused() -> None:
         stranger = TcpPeer(device.describe()["address"], f"{token()}x")
         assert stranger.hear() == "error the first line must be 'hello' and the token"
         stranger.leave()
+
+
+@pytest.mark.skipif(not can_relay(), reason="this system cannot share a socket with a process in this way")
+def test_go_is_answered_while_the_run_is_too_busy_to_look() -> None:
+    with led() as (device, peer):
+        with device._changed:
+            assert peer.ask("go 1") == "busy"
+            peer.say("go 2")
+        assert peer.hear() == "failed reason=busy", "the answer was for one shot"
+        assert device.wait_for("go", 20.0) == "1"
+        device.report("ready", {"shot": 0})
+        assert peer.hear() == "ready shot=0"
+        with device._changed:
+            assert peer.ask("go 3") == "busy", "also when it follows at once"
+
+
+def test_where_no_process_can_share_the_socket_the_run_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("labseq_follow.tcp.can_relay", lambda: False)
+    with led() as (device, peer):
+        assert [peer.ask("go 1"), peer.ask("go 2")] == ["busy", "failed reason=busy"]
+        assert device.wait_for("go", 20.0) == "1"
+        peer.leave()
+        again = reconnect(device)
+        assert again.ask("state?") == "state busy"
+        again.leave()
+
+
+def test_a_relay_that_is_killed_is_a_leader_that_left() -> None:
+    with led() as (device, peer):
+        relay: Any = device._link._relay  # pyright: ignore[reportAttributeAccessIssue]
+        if relay is not None:
+            relay._process.kill()
+            assert peer.hear() == ""
+            again = reconnect(device)
+            assert again.ask("go") == "busy"
+            again.leave()
 
 
 def test_200_silent_connections_neither_lead_nor_keep_the_leader_out() -> None:
