@@ -175,8 +175,9 @@ class Dialogue:
         return [self._failed("aborted")]
 
     def _receive_hello(self, words: str) -> list[str]:
+        first, _, others = words.partition(" ")
         try:
-            self._form = form_of(words)
+            self._form = form_of(words if "=" in first else others)  # the token has done its work
         except ValueError as error:
             return [self.error(str(error))]
         return [self._hello()]

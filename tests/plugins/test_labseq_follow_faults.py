@@ -131,6 +131,10 @@ def test_a_hello_that_asks_for_what_is_not_spoken_is_refused_with_the_reason(wor
     with led() as (_, peer):
         assert peer.ask(f"hello {words}") == f"error {reason}"
         assert peer.ask("state?") == "state idle", "in the form that it had"
+        assert peer.ask(f"hello {token()} version=3 form=json").startswith(
+            '{"answer": "hello", "protocol": 3'
+        )
+        assert peer.ask("state?") == '{"answer": "state", "state": "idle"}'
 
 
 def test_a_token_that_goes_on_is_refused() -> None:
