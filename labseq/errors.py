@@ -340,6 +340,10 @@ class TransientError(LabseqError):
         super().__init__(f"{device}: {message}" if device else message)
 
 
+class ShotAbortedError(TransientError):
+    """The external control system aborted the shot; it is repeated at the next `go`, however often."""
+
+
 class StepTimeoutError(TransientError):
     """A step took longer than the ``timeout`` of its policy.
 

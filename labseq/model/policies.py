@@ -19,6 +19,7 @@ from labseq.errors import (
     OverBudgetError,
     PluginLoadError,
     RecordingError,
+    ShotAbortedError,
     StopRequested,
     TransientError,
     UnknownPluginError,
@@ -145,6 +146,8 @@ class RunPolicy:
         """
         if isinstance(error, _ENDING):
             return "stop"
+        if isinstance(error, ShotAbortedError):  # the leader decides how often; the machine has not failed
+            return "repeat_shot"
         then = error.then if isinstance(error, OverBudgetError) else self.of_step(step).on_failure
         if then is None:
             then = "repeat_shot" if isinstance(error, TransientError) else "stop"
@@ -153,6 +156,6 @@ class RunPolicy:
 
 def may_be_retried(error: LabseqError) -> bool:
     """Whether a step that failed with this error may succeed if it is retried in the same shot."""
-    if isinstance(error, (*_ENDING, OverBudgetError)):
+    if isinstance(error, (*_ENDING, OverBudgetError, ShotAbortedError)):
         return False
     return isinstance(error, DeviceError | TransientError)

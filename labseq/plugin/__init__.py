@@ -32,6 +32,7 @@ from labseq.errors import (
     LimitError,
     PlanError,
     Problem,
+    ShotAbortedError,
     StopRequested,
     TransientError,
 )
@@ -173,6 +174,7 @@ __all__ = [
     "SensorMode",
     "Settings",
     "Shot",
+    "ShotAbortedError",
     "ShotRecord",
     "Signal",
     "Simulation",

@@ -252,6 +252,10 @@ class RunWriter:
         with explained(self.run_dir):
             sync_folder(self.run_dir)  # the file may not exist yet
 
+    def place_of(self, shot_index: int) -> dict[str, str]:
+        """Where a shot will be recorded if it counts: the folder of the "run", and in it the "file"."""
+        return {"run": str(self.run_dir), "file": self._free_name(shot_index, 0, counts=True)}
+
     def _free_name(self, shot_index: int, attempt: int, *, counts: bool) -> str:
         """The name of a shot's file, different from those that the run had before it was resumed."""
         for take in itertools.count(1):

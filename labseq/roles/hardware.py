@@ -141,6 +141,7 @@ class Hardware(ABC):
 
         Raises:
             DeviceError: A value exceeds its limit; the run ends safely.
+            ShotAbortedError: The external control system aborted the shot; it is repeated at the next `go`.
         """
 
 
@@ -409,13 +410,15 @@ class LeaderLink(Protocol):
         """
         ...
 
-    def report(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
+    def report(self, state: Literal["ready", "failed"], about: Mapping[str, Any]) -> str:
         """Answer the start signal; nothing is sent if there was none.
 
         Args:
             state: The outcome.
-            about: Details: "shot"; for a ready shot that was judged, "success" and "filling" (of the target,
-                0 to 1); for a failure its "reason".
+            about: Details: "shot"; its "record" so far (``ShotRecord``), whose times count from "start_s" on
+                the session's clock; the "target". For a ready shot the folder of its "run" and in it the
+                "file" that it will be written to; if it was judged, "success" and "filling" (of the target,
+                0 to 1). For a failure its "reason".
 
         Returns:
             The answer that the other system got: "ready", "failed"; "late" if a failure was reported when

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from labseq.errors import LabseqError
@@ -29,12 +29,16 @@ class LeaderAnswers:
         guard: Runs every call into them.
         record: Record of the shot.
         emit: Receives every event: name and values.
+        start_s: Start of the attempt, on the session's clock.
+        place: Where the shot will be recorded if it counts: "run" and "file"; empty if nowhere.
     """
 
     lab: Lab
     guard: Guard
     record: ShotRecord
     emit: Emit
+    start_s: float = 0.0
+    place: Mapping[str, str] = field(default_factory=dict[str, str])
 
     def follow(self, signal: str, timeout_s: float, device: str) -> None:
         """Wait for a signal; see ``labseq.plugin.Shot.follow``."""
@@ -79,9 +83,11 @@ class LeaderAnswers:
         call: Callable[..., Any],
         reason: str = "",
     ) -> None:
-        about: dict[str, bool | int | float | str] = {"shot": self.record.shot_index}
-        if state == "ready" and not math.isnan(self.record.filling_fraction):
-            about |= {"success": self.record.success, "filling": self.record.filling_fraction}
+        record = self.record
+        about: dict[str, Any] = {"shot": record.shot_index, "record": record, "start_s": self.start_s}
+        about |= {"target": self.lab.target, **(self.place if state == "ready" else {})}
+        if state == "ready" and not math.isnan(record.filling_fraction):
+            about |= {"success": record.success, "filling": record.filling_fraction}
         if reason:
             about["reason"] = reason
         if answer := call(name, self.lab.timeouts.call_s, leader.report, state, about):

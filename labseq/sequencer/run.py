@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from enum import Enum
 from functools import partial
 from types import MappingProxyType
@@ -28,7 +29,7 @@ from labseq.sequencer.lab import (
     make_safe,
     open_device,
 )
-from labseq.sequencer.leader import Emit, LeaderAnswers
+from labseq.sequencer.leader import Emit
 from labseq.sequencer.shot import Events, RunningShot, Stages
 from labseq.watchdog import Watchdog
 
@@ -177,6 +178,7 @@ class Sequencer:
         policy: Reactions to failures and exceeded budgets.
         parameters: Settings that differ from the files, recorded with each shot: address -> value.
         watchdog: Switches the outputs off if this process dies or hangs; by default one without a log.
+        place_of: Where the shot of an index will be recorded if it counts: "run" and "file".
 
     Attributes:
         lab: The devices.
@@ -198,6 +200,7 @@ class Sequencer:
         policy: RunPolicy = RunPolicy(),  # noqa: B008 - frozen
         parameters: Mapping[str, Any] | None = None,
         watchdog: Watchdog | None = None,
+        place_of: Callable[[int], Mapping[str, str]] = lambda _: {},
     ) -> None:
         self.lab = lab
         self._watchdog = watchdog or Watchdog()
@@ -208,6 +211,7 @@ class Sequencer:
         self._stop = stop
         self._sink = sink
         self._seed = seed
+        self._place_of = place_of
         self._policy = policy
         self._parameters = dict(parameters or {})
         self._states = StateTable(self._announce)
@@ -336,7 +340,8 @@ class Sequencer:
         self._warn_of_watchdog()
         record = ShotRecord(index, attempt, self._seed, now_utc(), parameters=self._parameters)
         record.calibrations = {kind: entry.id for kind, entry in self.lab.calibrations.items()}
-        shot = RunningShot(self.lab, self.guard, record, self._events, self._timelines)
+        place = self._place_of(index)
+        shot = RunningShot(self.lab, self.guard, record, self._events, self._timelines, place)
         failure: LabseqError | None = None
         then: Then | None = None
         try:  # what ends the run; within it, what the run goes on after
@@ -348,10 +353,10 @@ class Sequencer:
                     raise
                 failure = error
                 self._recover()
-                self._leaders(record).failed(error)
+                replace(shot.leaders, emit=self._emit).failed(error)
         except BaseException as error:  # KeyboardInterrupt too, where no signal handler could be set
             stopped = isinstance(error, StopRequested | KeyboardInterrupt)
-            self._abort(record, "interrupted" if stopped else "failed", error)
+            self._abort(shot, "interrupted" if stopped else "failed", error)
             raise
         self._close_record(record, "complete" if failure is None else "failed", failure)
         self._states.to(State.WRITING)
@@ -424,22 +429,19 @@ class Sequencer:
         with self._stop.held():
             _raise_first(make_safe(self.lab, self.guard, {"mobile_tweezers", "camera", "lines"}))
 
-    def _abort(self, record: ShotRecord, status: ShotStatus, error: BaseException) -> None:
+    def _abort(self, shot: RunningShot, status: ShotStatus, error: BaseException) -> None:
         """Make the devices safe; only then answer the other control system and write the shot."""
         self._secure()
         with self._stop.held():  # a driver may have to wait for its device in order to answer
-            self._leaders(record).failed(error)
-        self._close_record(record, status, error)
+            replace(shot.leaders, emit=self._emit).failed(error)
+        self._close_record(shot.record, status, error)
         try:
-            row = self._sink.write_shot(record)
+            row = self._sink.write_shot(shot.record)
         except Exception as failure:  # noqa: BLE001 - the first error is the one to report
             text = f"the interrupted shot could not be written: {error_text(failure)}"
             self._emit("warning", {"text": text})
         else:
-            self._emit("shot_finished", {"shot": record, "row": row})
-
-    def _leaders(self, record: ShotRecord) -> LeaderAnswers:
-        return LeaderAnswers(self.lab, self.guard, record, self._emit)
+            self._emit("shot_finished", {"shot": shot.record, "row": row})
 
     def _close_record(self, record: ShotRecord, status: ShotStatus, error: BaseException | None) -> None:
         record.status = status

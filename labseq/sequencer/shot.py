@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
+from types import MappingProxyType
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
@@ -199,6 +200,7 @@ class RunningShot:
 
     Args:
         record: Filled while the shot runs, so that nothing is lost if it fails.
+        place: Where it will be recorded, see :class:`LeaderAnswers`.
     """
 
     def __init__(
@@ -208,6 +210,7 @@ class RunningShot:
         record: ShotRecord,
         events: Events,
         timelines: Sequence[Sequence[TimelineEntry]] = (),
+        place: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.lab = lab
         self.record = record
@@ -233,7 +236,7 @@ class RunningShot:
         self._kept: tuple[float, float] | None = None
         self.stages = Stages(lab, record, events)
         self.start_s = self.stages.start_s
-        self.leaders = LeaderAnswers(lab, guard, record, events)
+        self.leaders = LeaderAnswers(lab, guard, record, events, self.start_s, place)
         self.series = CameraSeries(lab, timelines, partial(guard.call, "camera", lab.timeouts.call_s))
         self._fired_s = self._started_s = 0.0
         self._frame_s: tuple[float, float] | None = None

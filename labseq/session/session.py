@@ -91,6 +91,7 @@ class Shots:
             policy=run.assembly.policy,
             parameters=self._parameters(first),
             watchdog=watchdog,
+            place_of=writer.place_of,
         )
 
     def _warn_of(self, alarm: str, text: str) -> None:

@@ -12,13 +12,15 @@ from labseq.plugin import (
     Device,
     DeviceError,
     DeviceTimeoutError,
+    ShotAbortedError,
     format_quantity,
     wait_for,
 )
 from labseq.plugin.leader import GO, check_signal, load_atoms
 from labseq.plugin.messages import one_of
+from labseq_follow.answers import VERSION
 from labseq_follow.links import Event, Link, SerialLink, SimulatedLink
-from labseq_follow.protocol import VERSION, About, Dialogue, Splitter, encoded
+from labseq_follow.protocol import About, Dialogue, Splitter, encoded
 from labseq_follow.settings import SIMULATED, LinkSettings, SerialLeaderSettings, TcpLeaderSettings
 from labseq_follow.tcp import TcpLink
 
@@ -67,7 +69,7 @@ class LeaderDevice(Device):
 
     def _begin(self) -> None:
         """Forget everything of the last connection."""
-        self._dialogue = Dialogue(self._settings.deadline)
+        self._dialogue = Dialogue(self._settings.deadline, self._context.grid.shape)
         self._splitter = Splitter()
         self._failure: BaseException | None = None
 
@@ -131,7 +133,7 @@ class LeaderDevice(Device):
         return self._dialogue.state if name == "state" else self._dialogue.is_connected
 
     def wait_for(self, signal: str, timeout_s: float) -> str:
-        """Wait for `go`, and answer `busy`; see ``labseq.plugin.LeaderLink``.
+        """Wait for `go`, which the thread that received it has answered; see ``labseq.plugin.LeaderLink``.
 
         Raises:
             DeviceError: Not open, or another signal.
@@ -155,6 +157,15 @@ class LeaderDevice(Device):
         if self._settings.loads and not simulated:
             load_atoms(self._context, LOADING_S)
         return text
+
+    def check_interlocks(self) -> None:
+        """End the shot if the control system has aborted it.
+
+        Raises:
+            ShotAbortedError: It has.
+        """
+        if self._dialogue.is_aborted:
+            raise ShotAbortedError("the leader aborted the shot", self._name)
 
     def report(self, state: str, about: About) -> str:
         """Answer a `go`; see ``labseq.plugin.LeaderLink``.
@@ -192,9 +203,9 @@ class LeaderDevice(Device):
     def _handle(self, event: Event) -> None:
         with self._changed:
             match event:
-                case "connected", who:
+                case "connected", who, form:
                     self._splitter = Splitter()
-                    self._send(self._dialogue.connected(who))
+                    self._send(self._dialogue.connected(who, form))
                 case "came", data:
                     self._receive(data)
                 case "lost", reason:
@@ -209,7 +220,7 @@ class LeaderDevice(Device):
         for line in self._splitter.feed(data):
             if line is None:
                 self._dialogue.log.note("a line of the leader was too long, and was dropped")
-                self._send(["error the line is too long"])
+                self._send([self._dialogue.error("the line is too long")])
             else:
                 self._send(self._dialogue.receive_line(line, self._link.now()))
         self._changed.notify_all()
@@ -219,21 +230,22 @@ class LeaderDevice(Device):
             self._check_open()
             if self._failure is not None:
                 raise DeviceError(self._name, f"it no longer listens: {self._failure!r}")
-            taken = self._dialogue.take(self._link.now())
-            if taken is None:
+            text = self._dialogue.take(self._link.now())
+            if text is None:
                 self._changed.wait(longest_s)  # the caller looks again at once
-                return None
-            text, lines = taken
-            self._send(lines)
             return text
 
     def _send(self, lines: Sequence[str]) -> bool:
-        """Send lines; returns whether the control system received them."""
+        """Send lines; returns whether the control system received them.
+
+        What answers the next `go` is said first, because the control system may send it at once.
+        """
+        self._link.expect(encoded(answer) if (answer := self._dialogue.next_answer) else b"")
         try:
             for line in lines:
                 self._link.send(encoded(line))
         except OSError as error:
-            self._dialogue.log.note(f"'{lines[0]}' could not be sent to the leader: {error}")
+            self._dialogue.log.note(f"'{lines[0][:80]}' could not be sent to the leader: {error}")
             return False
         return True
 

@@ -11,23 +11,24 @@ from typing import Final, Literal, TypeAlias
 from labseq.plugin import Context, DeviceError
 from labseq.plugin.leader import GO, LeaderSettings, load_until_go
 from labseq.plugin.serial import BROKEN, Port, open_port
+from labseq_follow.answers import Form
 from labseq_follow.protocol import encoded
 from labseq_follow.settings import SerialLeaderSettings
 
 SLICE_S: Final = 0.02
 """Longest wait for something to come: how soon a deadline and the end are noticed."""
-SEND_S: Final = 0.5
-"""Longest time to send a line on a serial port."""
+SEND_S: Final = 5.0
+"""Longest time to send a line on a serial port; 5,000 bytes take 0.45 s at 115,200 bits per second."""
 REOPEN_S: Final = 0.5
 """Time between two attempts to open a port that was unplugged."""
 
 Event: TypeAlias = (
-    tuple[Literal["connected"], str]
+    tuple[Literal["connected"], str, Form]
     | tuple[Literal["came"], bytes]
     | tuple[Literal["lost"], str]
     | tuple[Literal["note"], str]
 )
-"""Who connected; bytes that came; why the connection was lost; a note for the log."""
+"""Who connected, and the form that it asks for; bytes; why the connection was lost; a note for the log."""
 
 
 class Link:
@@ -62,6 +63,9 @@ class Link:
     def poll(self) -> list[Event]:
         """Wait for at most :data:`SLICE_S`; returns what happened."""
         return []
+
+    def expect(self, answer: bytes) -> None:
+        """The next `go` is to be answered with this line; "" if it is not to be accepted."""
 
     def send(self, line: bytes) -> None:
         """Send a line; from any thread."""
@@ -116,7 +120,7 @@ class SerialLink(Link):
         events: list[Event] = []
         if not self._is_reported:
             self._is_reported = True
-            events.append(("connected", f"the control system on {self.address}"))
+            events.append(("connected", f"the control system on {self.address}", Form.SHORT))
         try:
             data = self._port.read(max(1, self._port.in_waiting))
         except (*BROKEN, TypeError) as error:  # pyserial reads None from a port that was closed

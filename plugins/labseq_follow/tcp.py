@@ -19,8 +19,10 @@ from typing import Any, Final
 from labseq.plugin import DeviceError, format_quantity
 from labseq.plugin.messages import clean
 from labseq.plugin.system import state_root
+from labseq_follow.answers import Form, form_of
 from labseq_follow.links import SLICE_S, Event, Link
 from labseq_follow.protocol import MAX_LINE, encoded
+from labseq_follow.relay import Relay, can_relay
 from labseq_follow.settings import TcpLeaderSettings
 
 TAKEN: Final = encoded("error another leader is connected; one at a time")
@@ -47,6 +49,7 @@ class TcpLink(Link):
         self.address = f"{settings.host}:{settings.port}"
         self._server: socket.socket | None = None
         self._leader: socket.socket | None = None
+        self._relay: Relay | None = None
         self._newcomers: dict[socket.socket, _Newcomer] = {}
         self._n_refused = 0
         self._selector: selectors.BaseSelector | None = None
@@ -67,6 +70,7 @@ class TcpLink(Link):
         self.address = f"{host}:{self._server.getsockname()[1]}"
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._server, selectors.EVENT_READ)
+        self._relay = Relay() if can_relay() else None
 
     def poll(self) -> list[Event]:
         """Accept connections, receive from them, notice that the control system left."""
@@ -77,11 +81,17 @@ class TcpLink(Link):
             if peer is self._server:
                 for _ in range(BACKLOG):
                     events += self._accept()
-            elif peer is self._leader:
+            elif peer is self._received_from():
                 events += self._receive()
             elif peer in self._newcomers:
                 events += self._receive_first_line(peer)
         return events + self._refuse_late_newcomers()
+
+    def expect(self, answer: bytes) -> None:
+        """Let the process beside the run answer the next `go`, if there is one."""
+        with self._sending:
+            if self._relay is not None and self._leader is not None:
+                self._relay.expect(answer)
 
     def send(self, line: bytes) -> None:
         """Send a line; a control system that does not take it is disconnected, and never waited for."""
@@ -100,6 +110,9 @@ class TcpLink(Link):
     def close(self) -> None:
         """Disconnect, and stop listening."""
         self._drop()
+        if self._relay is not None:
+            self._relay.close()
+            self._relay = None
         for peer in [*self._newcomers]:
             self._forget(peer)
         if self._selector is not None:
@@ -140,13 +153,19 @@ class TcpLink(Link):
         line, ended, rest = newcomer.came.partition(b"\n")
         if data and not ended and len(line) <= MAX_LINE:
             return []
-        if not hmac.compare_digest(line.strip(), b"hello " + self._token):
+        begin = b"hello " + self._token
+        words = line.strip()[len(begin) :]
+        if not hmac.compare_digest(line.strip()[: len(begin)], begin) or words.strip() == words != b"":
             return self._refuse(peer, f"its first line is {clean(repr(line)[1:])}", NO_TOKEN)
+        try:
+            form = form_of(words.decode("ascii", "backslashreplace"))
+        except ValueError as error:
+            return self._refuse(peer, str(error), encoded(f"error {error}"))
         if self._leader is not None:
             return self._refuse(peer, "another one is in control", TAKEN)
-        return self._welcome(peer, rest)
+        return self._welcome(peer, form, rest)
 
-    def _welcome(self, peer: socket.socket, rest: bytes) -> list[Event]:
+    def _welcome(self, peer: socket.socket, form: Form, rest: bytes) -> list[Event]:
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in KEEPALIVE:
@@ -154,7 +173,11 @@ class TcpLink(Link):
                 peer.setsockopt(socket.IPPROTO_TCP, number, value)
         who = self._newcomers.pop(peer).who
         self._leader = peer
-        return [("connected", who), *([("came", rest)] if rest else [])]
+        if self._relay is not None and self._selector is not None:
+            self._selector.unregister(peer)
+            self._relay.serve(peer)
+            self._selector.register(self._relay.received, selectors.EVENT_READ)
+        return [("connected", who, form), *([("came", rest)] if rest else [])]
 
     def _refuse(self, peer: socket.socket, why: str, answer: bytes = b"") -> list[Event]:
         """Close the connection of a newcomer; a flood of them must not fill the log."""
@@ -176,10 +199,15 @@ class TcpLink(Link):
             self._selector.unregister(peer)
         peer.close()
 
+    def _received_from(self) -> socket.socket | None:
+        """The socket with what the control system sends; None while none is connected."""
+        return self._relay.received if self._relay is not None and self._leader is not None else self._leader
+
     def _receive(self) -> list[Event]:
-        assert self._leader is not None
+        received = self._received_from()
+        assert received is not None
         try:
-            data, reason = self._leader.recv(4096), "it closed the connection"
+            data, reason = received.recv(4096), "it closed the connection"
         except BlockingIOError:
             return []
         except OSError as error:
@@ -191,11 +219,16 @@ class TcpLink(Link):
 
     def _drop(self) -> None:
         with self._sending:
-            if self._leader is not None:
-                if self._selector is not None:
-                    self._selector.unregister(self._leader)
-                self._leader.close()
+            received = self._received_from()
+            if self._leader is None or received is None:
+                return
+            if self._selector is not None:
+                self._selector.unregister(received)
+            self._leader.close()
             self._leader = None
+            if self._relay is not None:
+                self._relay.close()
+                self._relay = Relay()  # for the next one
 
 
 @dataclass(slots=True)

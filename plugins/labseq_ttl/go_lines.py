@@ -79,7 +79,7 @@ class GoLines(TtlLines):
                 self._handle(event)
         return ""
 
-    def report(self, state: str, about: Mapping[str, bool | int | float | str]) -> str:
+    def report(self, state: str, about: Mapping[str, Any]) -> str:
         """Raise `ready` or `failed`; see ``labseq.plugin.LeaderLink``.
 
         Raises:

@@ -108,7 +108,7 @@ def led(context: Context | None = None, **settings: Any) -> Generator[tuple[Lead
     """The same, and a leader that is connected."""
     with listening(context, **settings) as device:
         peer = TcpPeer(device.describe()["address"])
-        assert peer.hear().startswith("hello labseq 2 deadline=")
+        assert peer.hear().startswith("hello labseq 3 deadline=")
         try:
             yield device, peer
         finally:

@@ -62,11 +62,10 @@ class TestSimulated(LeaderContract):
 def test_go_is_answered_by_busy_and_then_by_the_result() -> None:
     with led() as (device, peer):
         assert device.report("ready", {"shot": 0}) == "", "there was no `go`"
-        peer.say("go run 17")
+        assert peer.ask("go run 17") == "busy", "although no step waits for it"
         assert peer.ask("state?") == "state busy"
         assert device.report("ready", {"shot": 0}) == "", "no step has waited for it"
         assert device.wait_for("go", 20.0) == "run 17"
-        assert peer.hear() == "busy"
         assert device.report("ready", {"shot": 12, "success": True, "filling": 0.98666}) == "ready"
         assert peer.hear() == "ready shot=12 success=1 filling=0.9867"
         peer.say("go")
@@ -88,7 +87,7 @@ def test_it_reports_its_state_at_any_time() -> None:
         waiting.join()
         assert peer.ask("state?") == "state busy"
         assert (device.read("state"), device.read("is_connected")) == ("busy", True)
-        assert peer.ask("hello") == "hello labseq 2 deadline=10"
+        assert peer.ask("hello") == "hello labseq 3 deadline=10"
 
 
 def test_at_the_deadline_it_answers_by_itself_and_a_late_ready_is_not_sent() -> None:
@@ -109,7 +108,7 @@ def test_at_the_deadline_it_answers_by_itself_and_a_late_ready_is_not_sent() -> 
 
 def test_a_go_that_no_step_waits_for_is_answered_at_the_deadline() -> None:
     with led(deadline=0.05) as (device, peer):
-        assert peer.ask("go") == "failed reason=deadline"
+        assert [peer.ask("go"), peer.hear()] == ["busy", "failed reason=deadline"]
         assert peer.ask("state?") == "state idle"
         assert any("no step waited" in text for text in device.new_events())
 
@@ -151,7 +150,7 @@ def on_a_line() -> Generator[tuple[Any, PtyPeer]]:
     device = serial_leader(SerialLeaderSettings(port=peer.port), Context("leader"))
     device.open()
     try:
-        assert peer.hear() == "hello labseq 2 deadline=10"
+        assert peer.hear() == "hello labseq 3 deadline=10"
         yield device, peer
     finally:
         device.close()
@@ -221,7 +220,7 @@ def test_loading_needs_a_simulated_lab() -> None:
         tcp_leader(TcpLeaderSettings(loads=True), Context("leader"))
 
 
-EVENTS = st.lists(st.sampled_from(["go", "take", "report", "pass", "leave", "noise"]), max_size=40)
+EVENTS = st.lists(st.sampled_from(["go", "take", "report", "pass", "leave", "noise", "abort"]), max_size=40)
 
 
 @given(EVENTS)
@@ -237,10 +236,13 @@ def test_each_go_gets_exactly_one_answer(events: list[str]) -> None:
             said += dialogue.receive_line("go", now_s)
         elif event == "noise":
             said += dialogue.receive_line("gog", now_s)
-        elif event == "take" and (taken := dialogue.take(now_s)) is not None:
-            said += taken[1]
+        elif event == "take":
+            dialogue.take(now_s)
+        elif event == "abort":
+            said += dialogue.receive_line("abort", now_s)
         elif event == "report":
             said += dialogue.report("ready", {"shot": 0}, now_s)[1]
+            assert not dialogue.is_aborted, "an abort is for one shot"
         elif event == "leave":
             n_lost += n_go_signals - n_lost - n_answers  # a leader that leaves gives up its answer
             dialogue.lost("it left")

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from labseq_follow.leader import LeaderDevice, serial_leader
+from labseq_follow.relay import can_relay
 from labseq_follow.settings import SerialLeaderSettings
 from labseq_follow.tcp import MAX_NEWCOMERS
 
@@ -30,8 +31,8 @@ def log(device: LeaderDevice) -> str:
 @pytest.mark.parametrize(
     ("noise", "answer"),
     [
-        (b"Go!\n", "error what is 'Go!'? expected go, state? or hello"),
-        (b"\xff\x00\x80\n", r"error what is '\xff\x00\x80'? expected go, state? or hello"),
+        (b"Go!\n", "error what is 'Go!'? expected go, abort, state? or hello"),
+        (b"\xff\x00\x80\n", r"error what is '\xff\x00\x80'? expected go, abort, state? or hello"),
         (b"x" * 10_000 + b"\n", "error the line is too long"),
     ],
     ids=["words", "bytes", "very long"],
@@ -58,6 +59,18 @@ def test_half_a_line_and_then_nothing_is_no_go() -> None:
         assert "did not end, and was dropped" in log(device)
 
 
+def refusal(device: LeaderDevice) -> str:
+    """The log, once it has the refusal that the peer has already seen."""
+    text = ""
+    while "was refused" not in text:
+        text += log(device)
+    return text
+
+
+def token() -> str:
+    return token_file().read_text().strip()
+
+
 def reconnect(device: LeaderDevice) -> TcpPeer:
     """Connect after the last leader left; until labseq has seen that, it turns others away."""
     while True:
@@ -80,9 +93,10 @@ POST = (
         ("go\n", "its first line is 'go'"),
         ("hello\ngo\n", "its first line is 'hello'"),
         (f"hello {'0' * 32}\ngo\n", "its first line is 'hello 0"),
+        (f"hello {'0' * 32} version=4\ngo\n", "its first line is 'hello 0"),
         ("x" * 500, "its first line is 'xxx"),
     ],
-    ids=["web page", "go", "no token", "wrong token", "no end"],
+    ids=["web page", "go", "no token", "wrong token", "wrong version and token", "no end"],
 )
 def test_without_the_token_nothing_starts(sent: str, quoted: str) -> None:
     with listening() as device:
@@ -97,6 +111,73 @@ def test_without_the_token_nothing_starts(sent: str, quoted: str) -> None:
             device.wait_for("go", 0.01)
         assert quoted in log(device)
         peer.leave()
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ("version=2", "version is 2; this labseq speaks version=3"),
+        ("form=json", "version is missing; this labseq speaks version=3"),
+        ("version=3 form=xml", "form is xml; expected text or json"),
+        ("version=3 colour=red", "'colour=red' in hello; expected version=3 and form=text or form=json"),
+    ],
+)
+def test_a_hello_that_asks_for_what_is_not_spoken_is_refused_with_the_reason(words: str, reason: str) -> None:
+    with listening() as device:
+        stranger = TcpPeer(device.describe()["address"], f"{token()} {words}")
+        assert [stranger.hear(), stranger.hear()] == [f"error {reason}", ""]
+        stranger.leave()
+        assert reason in refusal(device)
+    with led() as (_, peer):
+        assert peer.ask(f"hello {words}") == f"error {reason}"
+        assert peer.ask("state?") == "state idle", "in the form that it had"
+        assert peer.ask(f"hello {token()} version=3 form=json").startswith(
+            '{"answer": "hello", "protocol": 3'
+        )
+        assert peer.ask("state?") == '{"answer": "state", "state": "idle"}'
+
+
+def test_a_token_that_goes_on_is_refused() -> None:
+    with listening() as device:
+        stranger = TcpPeer(device.describe()["address"], f"{token()}x")
+        assert stranger.hear() == "error the first line must be 'hello' and the token"
+        stranger.leave()
+
+
+@pytest.mark.skipif(not can_relay(), reason="this system cannot share a socket with a process in this way")
+def test_go_is_answered_while_the_run_is_too_busy_to_look() -> None:
+    with led() as (device, peer):
+        with device._changed:
+            assert peer.ask("go 1") == "busy"
+            peer.say("go 2")
+        assert peer.hear() == "failed reason=busy", "the answer was for one shot"
+        assert device.wait_for("go", 20.0) == "1"
+        device.report("ready", {"shot": 0})
+        assert peer.hear() == "ready shot=0"
+        with device._changed:
+            assert peer.ask("go 3") == "busy", "also when it follows at once"
+
+
+def test_where_no_process_can_share_the_socket_the_run_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("labseq_follow.tcp.can_relay", lambda: False)
+    with led() as (device, peer):
+        assert [peer.ask("go 1"), peer.ask("go 2")] == ["busy", "failed reason=busy"]
+        assert device.wait_for("go", 20.0) == "1"
+        peer.leave()
+        again = reconnect(device)
+        assert again.ask("state?") == "state busy"
+        again.leave()
+
+
+def test_a_relay_that_is_killed_is_a_leader_that_left() -> None:
+    with led() as (device, peer):
+        relay: Any = device._link._relay  # pyright: ignore[reportAttributeAccessIssue]
+        if relay is not None:
+            relay._process.kill()
+            assert peer.hear() == ""
+            again = reconnect(device)
+            assert again.ask("go") == "busy"
+            again.leave()
 
 
 def test_200_silent_connections_neither_lead_nor_keep_the_leader_out() -> None:
@@ -163,7 +244,7 @@ def test_after_a_disconnect_the_shot_goes_on_and_its_result_is_sent_to_no_other(
 
 def test_a_go_whose_leader_left_before_a_step_waited_is_forgotten() -> None:
     with led() as (device, peer):
-        assert [peer.ask("hello")[:5], peer.say("go"), peer.ask("state?")] == ["hello", None, "state busy"]
+        assert [peer.ask("hello")[:5], peer.ask("go"), peer.ask("state?")] == ["hello", "busy", "state busy"]
         peer.leave()
         again = reconnect(device)
         assert again.ask("state?") == "state idle"
@@ -173,7 +254,7 @@ def test_a_go_whose_leader_left_before_a_step_waited_is_forgotten() -> None:
 def test_at_its_end_labseq_answers_and_closes_the_connection() -> None:
     with listening() as device:
         peer = TcpPeer(device.describe()["address"])
-        assert [peer.hear()[:5], peer.say("go"), peer.ask("state?")] == ["hello", None, "state busy"]
+        assert [peer.hear()[:5], peer.ask("go"), peer.ask("state?")] == ["hello", "busy", "state busy"]
         device.close()
         assert [peer.hear(), peer.hear()] == ["failed reason=labseq ends", ""]
         peer.leave()

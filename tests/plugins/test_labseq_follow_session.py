@@ -26,6 +26,7 @@ LOST = "profile.camera={use: virtual, readout: 5 ms, faults: {transient: 1.0}}"
 SMALL = "target={pattern: compact, rows: 3, cols: 3}"
 NO_LEADER = "follow.yaml:12:17: the profile has no device through which another control system leads"
 GUIDE = (ROOT / "docs" / "how-to" / "follow.md").read_text()
+PROGRAMS = re.findall(r"^```python\n(.*?)^```$", GUIDE, re.DOTALL | re.MULTILINE)
 
 
 class Led:
@@ -71,7 +72,7 @@ def events(run_dir: Path) -> list[dict[str, Any]]:
 
 
 def test_the_leader_of_the_guide_drives_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (code,) = re.findall(r"^```python\n(.*?)^```$", GUIDE, re.DOTALL | re.MULTILINE)
+    code, _ = PROGRAMS
 
     def lead(address: str) -> None:
         exec(code.replace("5750", address.rpartition(":")[2]).replace("shots(3)", "shots(2)"), {})
@@ -92,6 +93,18 @@ def test_the_leader_of_the_guide_drives_a_run(tmp_path: Path, capsys: pytest.Cap
     assert any(re.fullmatch(r"127\.0\.0\.1:\d+ leads", text) for text in logged)
 
 
+def test_the_client_of_the_guide_drives_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, code = PROGRAMS
+
+    def lead(address: str) -> None:
+        exec(code.replace("Leader()", f"Leader(port={address.rpartition(':')[2]})"), {})
+
+    (shot,) = run_led(lead, tmp_path, shots=1).shots
+    first, *rows = capsys.readouterr().out.splitlines()
+    assert first == f"0 {shot.file} {shot.target.n_defects(shot.occupancies[-1])}"
+    assert len(rows) > 5
+
+
 def test_a_run_that_is_stopped_tells_its_leader_why(tmp_path: Path) -> None:
     said: list[str] = []
 
@@ -102,7 +115,7 @@ def test_a_run_that_is_stopped_tells_its_leader_why(tmp_path: Path) -> None:
 
     with pytest.raises(StopRequested):
         run_led(lead, tmp_path, stop_at="image")
-    assert said == ["hello labseq 2 deadline=60", "busy", "failed shot=0 reason=stopped by Ctrl-C", ""]
+    assert said == ["hello labseq 3 deadline=60", "busy", "failed shot=0 reason=stopped by Ctrl-C", ""]
 
 
 def test_a_shot_that_fails_tells_its_leader_why(tmp_path: Path) -> None:

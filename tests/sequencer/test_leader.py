@@ -11,6 +11,7 @@ from labseq.errors import (
     DeviceError,
     DeviceTimeoutError,
     RecordingError,
+    ShotAbortedError,
     StopRequested,
     TransientError,
 )
@@ -128,6 +129,28 @@ def test_each_attempt_waits_for_atoms_of_its_own() -> None:
     assert states(made) == ["failed", "ready"]
     assert "a frame was lost" in leader_of(made).answers[0][1]["reason"]
     assert [shot.readings["leader.answer"] for shot in made.sink.shots] == [["failed"], ["ready"]]
+
+
+def test_a_leader_may_abort_more_often_than_a_shot_has_attempts() -> None:
+    class Aborting(RecordingLeader):
+        n_aborts = 0
+
+        def check_interlocks(self) -> None:
+            if self._answer_due and self.n_aborts < 4:
+                self.n_aborts += 1
+                raise ShotAbortedError("the leader aborted the shot", "leader")
+
+    class PickUp(WaitStep):
+        def run(self, shot: Any) -> None:
+            shot.check_interlocks()
+
+    made = rig(FOLLOW, IMAGE, ("pick_up", PickUp(given(duration=1.0))), attempts=2)
+    leader = Aborting(Context("leader", clock=made.lab.clock), made.lab.calls)
+    object.__setattr__(made.lab, "devices", {**made.lab.devices, "leader": leader})
+    made.run()
+    assert states(made) == ["failed"] * 4 + ["ready"]
+    assert leader.answers[0][1]["reason"].endswith("the leader aborted the shot")
+    assert [shot.status for shot in made.sink.shots] == ["failed"] * 4 + ["complete"]
 
 
 def test_a_transient_failure_is_reported_after_the_devices_are_safe() -> None:

@@ -70,7 +70,7 @@ def test_the_wheel_holds_what_it_needs_and_nothing_else(wheel: Path) -> None:
         inside = f"labseq/config/{folder}/"
         assert {name.removeprefix(inside) for name in names if name.startswith(inside)} == own
     tops = {name.split("/")[0] for name in names if ".dist-info" not in name}
-    assert tops == {"labseq", *PLUGINS}
+    assert tops == {"labseq", "labseq_client.py", *PLUGINS}
     own = {"labseq/testing/pytest_plugin.py"}
     assert not [name for name in names if ("test_" in name and name not in own) or "__pycache__" in name]
 

@@ -522,7 +522,7 @@ class RecordingLeader(RecordingDevice):
 
     Attributes:
         goes_after_s: That time, in seconds.
-        answers: The state reported for each `go`, with its details.
+        answers: The state reported for each `go`, with its details that are numbers and text.
         noted: Events that new_events() returns, once.
     """
 
@@ -547,13 +547,14 @@ class RecordingLeader(RecordingDevice):
         self._n_gos += 1
         return str(self._n_gos)
 
-    def report(self, state: Literal["ready", "failed"], about: Mapping[str, bool | int | float | str]) -> str:
+    def report(self, state: Literal["ready", "failed"], about: Mapping[str, Any]) -> str:
         """Record the answer, if one is due."""
         self.use("report", state)
         if not self._answer_due:
             return ""
         self._answer_due = False
-        self.answers.append((state, dict(about)))
+        plain = {key: value for key, value in about.items() if key not in ("record", "target", "start_s")}
+        self.answers.append((state, plain))
         return state
 
     def new_events(self) -> Sequence[str]:
