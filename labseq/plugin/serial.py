@@ -163,7 +163,7 @@ def serial_emergency(
         set_options["write_timeout"] = 1.0  # a device that takes no bytes must not block this
     values = [asdict(message) for message in messages]
     arguments = {"port": name, "options": set_options, "messages": values, "encoding": encoding, "echo": echo}
-    return Emergency(Path(__file__).parents[1] / "drivers" / "serial_emergency.py", arguments)
+    return Emergency(Path(__file__).with_name("serial_emergency.py"), arguments)
 
 
 def is_network_port(url: str) -> bool:

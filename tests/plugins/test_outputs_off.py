@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from labseq.cli import main
-from labseq.drivers import serial_emergency as script
+from labseq.plugin import serial_emergency as script
 
 from .labseq_serial_rig import PROFILE as INSTRUMENT, Simulator, opened
 from .labseq_soapy_rig import until
