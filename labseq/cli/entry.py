@@ -40,11 +40,21 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except usage_error as error:
         code = _report_usage(error, arranged)
     except BaseException as error:  # noqa: BLE001 - the one place where an error becomes an exit code
-        code = report(error, debug="--debug" in arranged[:1])
+        code = report(_of_current_folder(error), debug="--debug" in arranged[:1])
     discard_unwritten()
     if arguments is None:
         _end_process(code)
     sys.exit(code)
+
+
+def _of_current_folder(error: BaseException) -> BaseException:
+    """The error; but if the current folder was deleted, which any relative path needs, one that says so."""
+    if isinstance(error, FileNotFoundError):
+        try:
+            os.getcwd()  # noqa: PTH109 - nothing but whether it exists
+        except FileNotFoundError:
+            return ConfigError("the current folder no longer exists; change to another one with 'cd'")
+    return error
 
 
 def arrange(arguments: Sequence[str]) -> list[str]:

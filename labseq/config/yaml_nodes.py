@@ -170,8 +170,8 @@ def compose(text: str, source: str, *, is_option: bool = False) -> Node | None:
     try:
         root = composer.get_single_node()
     except MarkedYAMLError as error:
-        # A stray closing bracket makes the level negative.
-        opened = composer.marks[-1] if composer.flow_level > 0 else None
+        # A stray closing bracket makes the level negative; a stray opening one leaves no mark.
+        opened = composer.marks[-1] if composer.flow_level > 0 and composer.marks else None
         from labseq.config.syntax_errors import explain_syntax_error  # a right file needs no explanation
 
         found = explain_syntax_error(error, text, composer.last, opened)
@@ -327,7 +327,8 @@ class _Composer(yaml.SafeLoader):
 
 
 def _key_text(node: yaml.Node) -> str:
-    return cast("str", node.value.value if isinstance(node, _Alias) else node.value)
+    value = node.value.value if isinstance(node, _Alias) else node.value
+    return value if isinstance(value, str) else ""  # a list or mapping as a key is a problem by now
 
 
 def comma_hint(key: str, value: Any) -> str:

@@ -81,9 +81,14 @@ def read_frames(path: Path) -> dict[int, Frame]:
 
     Raises:
         RecordingError: As for :func:`read_content`; or the frames are compressed
-            and the package for it is missing.
+            and the package for it is missing; or two of them are of the same image.
     """
-    return dict(sorted(iter_frames(path)))
+    frames: dict[int, Frame] = {}
+    for i, frame in iter_frames(path):
+        if i in frames:
+            raise RecordingError(path, f"has two frames of image {i}", "restore it from a backup")
+        frames[i] = frame
+    return {i: frames[i] for i in sorted(frames)}
 
 
 def iter_frames(path: Path, only: int | None = None) -> Generator[tuple[int, Frame]]:

@@ -22,6 +22,13 @@ from labseq.wire import LOST_S, PROTOCOL, Connections, MessageError, pack, repor
 
 MAX_SESSIONS: Final = 64
 """Maximum number of connections at a time; a client that makes more is faulty."""
+_FIELDS: Final[Mapping[str, Mapping[str, type]]] = {
+    "hello": {"protocol": int, "labseq": str, "who": str, "device": str, "kind": str},
+    "beat": {"session": bytes},
+    "bye": {"session": bytes},
+    "abort": {"session": bytes, "number": int},
+}
+"""Request -> its fields, and their types."""
 
 
 class Control:
@@ -67,7 +74,6 @@ class Control:
                 self._step()
                 self._keys.read_again()
                 if (now_s := time.monotonic()) > checked_s + POLL_S:
-                    self._connections.limit()
                     self._end_lost_sessions(now_s, now_s - checked_s, self._connections.ended())
                     checked_s = time.monotonic()
         except BaseException as error:  # noqa: BLE001 - the main thread ends the server
@@ -106,13 +112,13 @@ class Control:
         number = 0
         try:
             message = unpack([frame.buffer for frame in frames[1:]])
-            if type(message["n"]) is not int:
+            if not isinstance(message, dict) or type(message.get("n")) is not int:
                 raise MessageError("it has no number")
             number = message["n"]
             return pack({"n": number, "value": self._value(message, frames[-1])})
         except DeviceError as error:
             return pack({"n": number, "error": report_error(error)})
-        except (MessageError, KeyError, TypeError, AttributeError) as error:
+        except Exception as error:  # noqa: BLE001 - no message may end this thread
             failure = DeviceError("server", f"the server cannot read a message: {format_error(error)}")
             return pack({"n": number, "error": report_error(failure)})
 
@@ -123,31 +129,33 @@ class Control:
         peer = str(frame.get("User-Id")) if self._keys.own is not None else ""
         if not self._keys.is_known(peer):
             raise DeviceError("server", "the key was withdrawn")
-        if message["op"] == "hello":
-            return self._hello(message, peer, self._connections.named(frame.get(zmq.SRCFD)))
-        handler = {"beat": self._beat, "bye": self._bye, "abort": self._abort}.get(message["op"])
-        if handler is None:
+        request = message.get("op")
+        if not isinstance(request, str) or request not in _FIELDS:
             raise MessageError("its request is unknown")
+        for name, kind in _FIELDS[request].items():
+            if type(message.get(name)) is not kind:
+                raise MessageError(f"'{name}' is not of the type {kind.__name__}")
+        if request == "hello":
+            return self._hello(message, peer, self._connections.named(frame.get(zmq.SRCFD)))
+        handler = {"beat": self._beat, "bye": self._bye, "abort": self._abort}[request]
         return handler(message, *self._of(message, peer))
 
     def _hello(self, message: Mapping[str, Any], peer: str, connection: tuple[int, int]) -> dict[str, Any]:
         if message["protocol"] != PROTOCOL:
-            theirs = f"{clean(str(message['labseq']))} speaks protocol {clean(str(message['protocol']))}"
+            theirs = f"{clean(message['labseq'])} speaks protocol {clean(str(message['protocol']))}"
             ours = f"labseq {labseq.__version__} of the server speaks {PROTOCOL}"
             raise DeviceError("server", f"labseq {theirs}, and {ours}; update one of them")
-        device = self._devices.get(str(message["device"]))
+        device = self._devices.get(message["device"])
         if device is None:
-            text = (
-                f"there is no device '{clean(str(message['device']))}'; expected {one_of([*self._devices])}"
-            )
+            text = f"there is no device '{clean(message['device'])}'; expected {one_of([*self._devices])}"
             raise DeviceError("server", text)
         if message["kind"] != device.kind:
-            used = clean(str(message["kind"]))
+            used = clean(message["kind"])
             text = f"'{device.name}' is of the kind {device.kind}, and the profile uses it as {used}"
             raise DeviceError("server", text)
         if sum(len(other.sessions) for other in self._devices.values()) >= MAX_SESSIONS:
             raise DeviceError("server", f"it already has {MAX_SESSIONS} connections")
-        session = Session(peer, f"{self._keys.name(peer)} ({clean(str(message['who']))})", connection)
+        session = Session(peer, f"{self._keys.name(peer)} ({clean(message['who'])})", connection)
         device.sessions[session.token] = session
         return {
             "protocol": PROTOCOL,

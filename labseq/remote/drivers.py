@@ -17,6 +17,7 @@ from labseq.files import devices_root
 from labseq.guard import Guard, StopFlag
 from labseq.kernels.kernel import load_kernels
 from labseq.messages import format_error
+from labseq.model import CalibrationEntry, LineSpec, MotionSpec, SiteGrid
 from labseq.recording import clear_active, mark_active
 from labseq.roles import ROLES, Context, overrides
 from labseq.sequencer.clock import RealClock
@@ -77,6 +78,25 @@ class DeviceEntry:
         return f"labseq serve-devices {self.name}"
 
 
+def _checked_context(context: Any) -> tuple[str, tuple[LineSpec, ...]]:
+    """Name and lines in a client's context, after the types of all its fields have been checked.
+
+    Raises:
+        DeviceError: One is wrong.
+    """
+    kinds = {"name": str, "grid": SiteGrid, "motion": MotionSpec, "lines": list, "calibrations": dict}
+    if not isinstance(context, dict):
+        raise DeviceError("server", "the context is not a mapping")
+    for key, kind in kinds.items():
+        if type(context.get(key)) is not kind:
+            raise DeviceError("server", f"'{key}' of the context is not of the type {kind.__name__}")
+    if not all(isinstance(line, LineSpec) for line in context["lines"]):
+        raise DeviceError("server", "'lines' of the context has other values than lines")
+    if not all(isinstance(entry, CalibrationEntry) for entry in context["calibrations"].values()):
+        raise DeviceError("server", "'calibrations' of the context has other values than calibrations")
+    return context["name"], tuple(context["lines"])
+
+
 class ClientDriver:
     """A client's own object of the driver of a served device, with its watchdog.
 
@@ -101,7 +121,7 @@ class ClientDriver:
     def __init__(
         self,
         entry: DeviceEntry,
-        client_context: Mapping[str, Any],
+        client_context: Any,
         abort: StopFlag,
         report: Callable[[str], object],
     ) -> None:
@@ -111,7 +131,7 @@ class ClientDriver:
         self._abort = abort
         self._report = report
         self._watchdog: Watchdog | None = None
-        name, lines = client_context["name"], tuple(client_context["lines"])
+        name, lines = _checked_context(client_context)
         if entry.plugin.virtual_time and name in [line.triggers for line in lines]:
             problem = f"'{entry.name}' is simulated at its server, where no line can trigger it"
             raise ConfigError(Problem(problem, hint="'--dry-run' simulates all devices in one place"))

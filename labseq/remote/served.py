@@ -18,7 +18,7 @@ from labseq.errors import ConfigError, DeviceError, Problem, StopRequested
 from labseq.messages import format_error
 from labseq.remote.drivers import DESCRIBING, ClientDriver, DeviceEntry
 from labseq.remote.sessions import Session
-from labseq.wire import MAX_CONNECTIONS, Connections, MessageError, pack, report_error, unpack
+from labseq.wire import Connections, MessageError, pack, report_error, unpack
 
 POLL_S: Final = 0.03
 """Longest time that a thread waits for messages before it does its other work, in seconds."""
@@ -152,7 +152,6 @@ class ServedDevice:
             while not (self._ended.is_set() and not self.sessions):
                 if time.monotonic() - checked_s > POLL_S:
                     connections.ended()  # discards them: sessions end at the control port
-                    connections.limit(0 if self._ended.is_set() else MAX_CONNECTIONS)
                     checked_s = time.monotonic()
                 self._step()
         except BaseException as error:  # noqa: BLE001 - the main thread ends the server
@@ -257,7 +256,7 @@ class ServedDevice:
             driver = owner.driver
         return driver.call(call.call, call.args, call.named)
 
-    def _attach(self, session: Session, client_context: dict[str, Any]) -> dict[str, Any]:
+    def _attach(self, session: Session, client_context: Any) -> dict[str, Any]:
         """Construct the client's driver."""
         if session.driver is not None:
             raise DeviceError(self.name, "the connection already has a driver")

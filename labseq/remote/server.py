@@ -27,6 +27,7 @@ from labseq.plain import now
 from labseq.recording import clear_active
 from labseq.remote.control import Control
 from labseq.remote.drivers import DeviceEntry
+from labseq.remote.gate import Gate
 from labseq.remote.known import KnownKeys
 from labseq.remote.served import POLL_S, ServedDevice
 from labseq.safety.devices import check_each_device
@@ -190,9 +191,11 @@ class Server:
         self._keys = KnownKeys(own, self._report)
         self.devices: dict[str, ServedDevice] = {}
         try:
-            socket = server_socket(self._zmq, host, port, own)
-            for number, entry in enumerate(entries, 1):
-                at_device = server_socket(self._zmq, host, port + number, own)
+            self._gate = Gate(host, port, 1 + len(entries), own is not None, self._report)
+            sockets = [server_socket(self._zmq, address, own) for address in self._gate.addresses]
+            self._addresses = [socket.get_string(zmq.LAST_ENDPOINT) for socket in sockets]
+            socket, *at_devices = sockets
+            for entry, at_device in zip(entries, at_devices, strict=True):
                 known = self._keys.is_known
                 self.devices[entry.name] = ServedDevice(entry, at_device, port, known, self._report)
         except ConfigError:
@@ -204,6 +207,7 @@ class Server:
     def start(self) -> None:
         """Begin to serve."""
         self._keys.start(self._zmq)
+        self._gate.start(self._addresses)
         for device in self.devices.values():
             device.start()
         self._control.start()
@@ -214,6 +218,7 @@ class Server:
 
     def end(self) -> None:
         """Make all devices safe, at the same time, and end all threads."""
+        self._gate.accept_no_more()
         for device in self.devices.values():
             device.begin_end()
         while self._spare:
@@ -225,6 +230,7 @@ class Server:
             time.sleep(POLL_S)
         late = [device.name for device in alive]
         self._control.end()
+        self._gate.end()
         self._keys.end()
         for name in late:
             self._report(f"{name}: NOT SAFE: a call does not return")
@@ -232,12 +238,16 @@ class Server:
             self._zmq.destroy(linger=0)
 
     def check(self) -> None:
-        """Raise what ended the thread of the control, or of a device.
+        """Raise what ended the thread of the gate, of the control, or of a device.
 
         Raises:
             DeviceError: It has ended.
         """
-        for failure in (self._control.failure, *(device.failure for device in self.devices.values())):
+        for failure in (
+            self._gate.failure,
+            self._control.failure,
+            *(device.failure for device in self.devices.values()),
+        ):
             if failure is not None:
                 raise DeviceError("serve-devices", format_error(failure)) from failure
 

@@ -47,7 +47,7 @@ _HEADERS: Final = {
     "cross-origin-opener-policy": "same-origin",
     "permissions-policy": "camera=(), microphone=(), geolocation=()",
 }
-SEND_S: Final = 60.0
+SEND_S: Final = 20.0
 """Close a connection whose browser has not read for this long, in seconds."""
 
 
@@ -176,7 +176,10 @@ class Guard:
             async with asyncio.timeout(SEND_S):  # a browser that no longer reads
                 await send(message)
 
-        refusal = self._refusal(scope, headers, address)
+        try:
+            refusal = self._refusal(scope, headers, address)
+        except ValueError:  # of urlsplit()
+            refusal = 400, "a header of the request is malformed"
         if refusal is not None:
             await _answer(send_safely, *refusal)
         elif self._is_first_visit(scope):

@@ -16,6 +16,7 @@ from starlette.requests import Request
 
 from labseq.config.document import Document
 from labseq.config.find import is_path
+from labseq.config.yaml_nodes import compose
 from labseq.errors import ConfigError, Problem
 from labseq.files import SEQUENCES, packaged_sequences_dir
 from labseq.messages import clean
@@ -137,6 +138,11 @@ class Actions:
         if unknown := [*{str(address) for address in changes} - addresses]:  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
             # --set could also change plugin folders and devices, which visitors must not
             raise ConfigError(Problem(f"'{clean(unknown[0])}' is not a value of the form"))
+        for address, value in changes.items():  # pyright: ignore[reportUnknownVariableType]
+            # a mapping in place of a value could name a file
+            node = compose(str(value), f"--set {address}", is_option=True)
+            if node is not None and isinstance(node.value, dict | list):
+                raise ConfigError(Problem(f"'{clean(str(address))}' is not a single value"))  # pyright: ignore[reportUnknownArgumentType]
         options = [f"--set={address}={value}" for address, value in changes.items()]  # pyright: ignore[reportUnknownVariableType]
         if profile := str(values.get("profile") or ""):
             if is_path(profile):
@@ -261,7 +267,8 @@ def _mapping_fields(
     properties = _properties(schema, definitions, data)
     for key in dict.fromkeys((*data, *properties)):
         about, value = _resolved(properties.get(key) or {}, definitions), data.get(key)
-        if key in _NOT_IN_FORM or key == "scan":
+        # a path would let visitors find out which files the computer has
+        if key in _NOT_IN_FORM or key == "scan" or about.get("format") == "path":
             continue
         address = f"{prefix}{key}"
         if isinstance(value, dict):

@@ -89,9 +89,9 @@ async def answer(endpoint: Endpoint, request: Request) -> Response:
     )
 
 
-async def in_thread(work: Callable[[], T]) -> T:
+async def in_thread(work: Callable[[], T], threads: ThreadPoolExecutor = _THREADS) -> T:
     """Run a slow function in a thread, so that it does not hold up other requests."""
-    return await asyncio.get_running_loop().run_in_executor(_THREADS, work)
+    return await asyncio.get_running_loop().run_in_executor(threads, work)
 
 
 def encode(values: object) -> str:

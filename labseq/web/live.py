@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import zlib
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
 
 from labseq.errors import LabseqError
@@ -19,6 +20,8 @@ POLL_S: Final = 0.1
 HEARTBEAT_S: Final = 15.0
 """Something is sent at least this often, in seconds, so that a dead connection is noticed."""
 MAX_VIEWERS: Final = 100
+_THREADS: Final = ThreadPoolExecutor(2, "labseq web live")
+"""Pages that watch many runs must not keep other requests waiting for a thread."""
 
 
 class Channel:
@@ -71,7 +74,7 @@ class Channel:
     async def _follow(self) -> None:
         """Read the run while at least one browser watches it."""
         while self.n_viewers:
-            state = await in_thread(self._read)
+            state = await in_thread(self._read, _THREADS)
             shot, text = encode(state.pop("shot", None)), encode(state)
             if (text, shot) != (self._text, self._shot):
                 self._text, self._shot = text, shot

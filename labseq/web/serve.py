@@ -67,6 +67,7 @@ def serve(data: Path | None, serving: Serving) -> None:
     from labseq.kernels.kernel import interpret
     from labseq.session.notices import FREE_GB, NoticeSettings
     from labseq.web.app import make_app
+    from labseq.web.connections import LimitedProtocol
     from labseq.web.state import Limits
 
     root = (data or data_root()).expanduser().absolute()
@@ -86,6 +87,7 @@ def serve(data: Path | None, serving: Serving) -> None:
         say(line)
     config = uvicorn.Config(
         app,  # pyright: ignore[reportArgumentType]
+        http=LimitedProtocol,
         log_level="critical",  # errors are in the answers
         access_log=False,
         server_header=False,

@@ -5,8 +5,8 @@ from labseq.wire.keys import find_keys, keys_root, known_keys, new_keys, read_pu
 from labseq.wire.messages import MessageError, error_of, pack, report_error, unpack
 from labseq.wire.sockets import (
     BEAT_S,
+    HANDSHAKE_S,
     LOST_S,
-    MAX_CONNECTIONS,
     PROTOCOL,
     Connections,
     client_socket,
@@ -18,8 +18,8 @@ from labseq.wire.sockets import (
 
 __all__ = [
     "BEAT_S",
+    "HANDSHAKE_S",
     "LOST_S",
-    "MAX_CONNECTIONS",
     "PROTOCOL",
     "Connections",
     "MessageError",

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from labseq import errors, model
 from labseq.errors import DeviceError, LabseqError
 from labseq.messages import error_text, format_error, one_line, visible
+from labseq.model import SiteGrid
 
 Part: TypeAlias = bytes | memoryview
 
@@ -33,10 +34,14 @@ SMALL: Final = 1 << 14
 ALIGNMENT: Final = 16
 """Arrays in the shared part begin at multiples of this, in bytes."""
 MAX_PARTS: Final = 256
+MAX_MESSAGE: Final = 1 << 28
+"""Largest sum of all parts, in bytes."""
 MAX_DEPTH: Final = 16
+MAX_SITES: Final = 1_000_000
+"""Most sites of all grids in a message, as many as a profile may have: a grid works out their positions."""
 
 _NUMBERS: Final = re.compile(r"[|<](?:b1|[iu][1248]|f[48])")
-_TEXT: Final = re.compile(r"\|S\d{1,4}|<U\d{1,4}")
+_TEXT: Final = re.compile(r"(?:\|S|<U)[1-9]\d{0,3}")
 
 TYPES: Final[Mapping[str, type]] = {
     cls.__name__: cls
@@ -97,8 +102,11 @@ def pack(value: Any) -> list[Part]:
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MessageError(f"it cannot be sent: {format_error(error)}") from error
     parts: list[Part] = [header, bytes(small), *arrays] if small or arrays else [header]
-    if len(header) > MAX_HEADER or len(parts) > MAX_PARTS or max(map(len, parts)) > MAX_PART:
-        raise MessageError(f"it is too large to be sent: at most {MAX_PARTS} parts of {MAX_PART >> 20} MB")
+    sizes = [len(part) for part in parts]
+    is_large = sizes[0] > MAX_HEADER or max(sizes) > MAX_PART or sum(sizes) > MAX_MESSAGE
+    if is_large or len(parts) > MAX_PARTS:
+        most = f"{MAX_PARTS} parts of {MAX_PART >> 20} MiB, {MAX_MESSAGE >> 20} MiB in all"
+        raise MessageError(f"it is too large to be sent: at most {most}")
     return parts
 
 
@@ -154,7 +162,8 @@ def _plain(value: Any) -> Any:
 def unpack(parts: Sequence[Part]) -> Any:
     """The value that a message contains; its arrays are read-only and share the memory of the parts.
 
-    Sizes and shapes are checked before anything is made of them.
+    Sizes and shapes are checked before anything is made of them. No byte belongs to two arrays, so all arrays
+    together are no larger than the message.
 
     Raises:
         MessageError: It is damaged, too large, or contains a value that messages cannot carry.
@@ -163,10 +172,13 @@ def unpack(parts: Sequence[Part]) -> Any:
 
     if not 1 <= len(parts) <= MAX_PARTS:
         raise MessageError(f"it has {len(parts)} parts; expected 1 to {MAX_PARTS}")
-    depth = 0
+    if (n_bytes := sum(map(len, parts))) > MAX_MESSAGE:
+        raise MessageError(f"it has {n_bytes} bytes; expected at most {MAX_MESSAGE}")
+    depth, n_sites = 0, 0
+    unused = [0] * len(parts)  # the first byte of each part that no array has had yet
 
     def rebuild(code: int, data: bytes) -> Any:
-        nonlocal depth
+        nonlocal depth, n_sites
         depth += 1
         if depth > MAX_DEPTH:
             raise MessageError("it is nested too deeply")
@@ -175,14 +187,21 @@ def unpack(parts: Sequence[Part]) -> Any:
         if not isinstance(content, list):
             raise MessageError("it is damaged")
         if code == _ARRAY:
-            return _array(parts, cast("list[Any]", content))
+            return _array(parts, cast("list[Any]", content), unused)
         if code == _OBJECT:
+            n_sites += _count_sites(cast("list[Any]", content))
+            if n_sites > MAX_SITES:
+                raise MessageError(f"its grids have more than {MAX_SITES} sites")
             return _object(cast("list[Any]", content))
         if code in (_TUPLE, _SET):
             return tuple(content) if code == _TUPLE else frozenset(content)
         raise MessageError(f"it contains something of the unknown type {code}")
 
     def inner(data: Part) -> Any:
+        # msgpack reserves memory for the length that a list announces, so first see that its items have come
+        scanner = msgpack.Unpacker(read_size=len(data) + 1, max_buffer_size=MAX_HEADER + 1)
+        scanner.feed(data)
+        scanner.skip()
         return msgpack.unpackb(data, ext_hook=rebuild, strict_map_key=True)
 
     header = memoryview(parts[0])
@@ -196,7 +215,7 @@ def unpack(parts: Sequence[Part]) -> Any:
         raise MessageError(f"it is damaged: {format_error(error)[:200]}") from error
 
 
-def _array(parts: Sequence[Part], content: list[Any]) -> NDArray[Any]:
+def _array(parts: Sequence[Part], content: list[Any], unused: list[int]) -> NDArray[Any]:
     place, dtype, shape, descriptions = content
     if isinstance(dtype, list):
         columns = [(str(name), _checked_dtype(text)) for name, text in cast("list[Any]", dtype)]
@@ -206,11 +225,13 @@ def _array(parts: Sequence[Part], content: list[Any]) -> NDArray[Any]:
     if (
         not isinstance(shape, list)
         or len(cast("list[Any]", shape)) > 4
-        or any(type(n) is not int or not 0 <= n <= MAX_PART * MAX_PARTS for n in cast("list[Any]", shape))
+        or any(type(n) is not int or n < 0 for n in cast("list[Any]", shape))
+        # an axis of length 0 must not hide that another one is endless
+        or not 0 < math.prod(max(n, 1) for n in cast("list[int]", shape)) * kind.itemsize <= MAX_PART
     ):
         raise MessageError("an array has a wrong shape")
     n_bytes = math.prod(cast("list[int]", shape)) * kind.itemsize
-    data = _data(parts, place, n_bytes)
+    data = _data(parts, place, n_bytes, unused)
     if data.nbytes != n_bytes:
         raise MessageError(f"an array of shape {tuple(shape)} has {data.nbytes} bytes; expected {n_bytes}")
     array = np.frombuffer(data, kind).reshape(shape) if n_bytes else np.empty(shape, kind)
@@ -220,11 +241,17 @@ def _array(parts: Sequence[Part], content: list[Any]) -> NDArray[Any]:
     return array
 
 
-def _data(parts: Sequence[Part], place: Any, n_bytes: int) -> memoryview:
-    """The bytes of an array, from their place as :func:`_add_array` gives it."""
+def _data(parts: Sequence[Part], place: Any, n_bytes: int, unused: list[int]) -> memoryview:
+    """The bytes of an array, from their place as :func:`_add_array` gives it.
+
+    Arrays that shared bytes would cost more memory than the message has, because unaligned ones are copied.
+    """
     part, begin = place
     if type(part) is not int or type(begin) is not int or not 1 <= part < len(parts) or begin < 0:
         raise MessageError("an array is missing")
+    if begin < unused[part]:
+        raise MessageError("two of its arrays have the same bytes")
+    unused[part] = begin + n_bytes
     return memoryview(parts[part])[begin : begin + n_bytes]
 
 
@@ -232,6 +259,18 @@ def _checked_dtype(text: Any) -> np.dtype[Any]:
     if not isinstance(text, str) or not (_NUMBERS.fullmatch(text) or _TEXT.fullmatch(text)):
         raise MessageError(f"an array has the unknown dtype {str(text)[:20]!r}")
     return np.dtype(text)
+
+
+def _count_sites(content: list[Any]) -> int:
+    """The number of sites of an object, as its fields give it; 0 if it is not a grid."""
+    name, values = content
+    if name != SiteGrid.__name__:
+        return 0
+    fields = dict(zip(_FIELDS[name], values, strict=True))
+    n_rows, n_cols = fields["n_rows"], fields["n_cols"]
+    if type(n_rows) is not int or type(n_cols) is not int or n_rows < 1 or n_cols < 1:
+        raise MessageError("a grid has a wrong size")
+    return n_rows * n_cols
 
 
 def _object(content: list[Any]) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from contextlib import suppress
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
 
@@ -23,8 +22,10 @@ BEAT_S: Final = 0.15
 """Interval of the heartbeats of a connection, in seconds."""
 LOST_S: Final = 0.75
 """A connection without a heartbeat for this long is lost, in seconds."""
-MAX_CONNECTIONS: Final = 128
-"""Maximum number of connections at a port; with more it does not listen until some have ended."""
+HANDSHAKE_S: Final = 2.0
+"""Longest time for a client to show its key, in seconds."""
+MAX_WAITING: Final = 16
+"""Messages of a connection that wait to be read, or to be sent: a client waits for each reply."""
 
 _ADDRESS: Final = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]@]+):(\d{1,5})")
 
@@ -88,26 +89,19 @@ def endpoint(host: str, port: int) -> str:
     return f"tcp://{f'[{host}]' if ':' in host else host}:{port}"
 
 
-def server_socket(context: zmq.Context[Any], host: str, port: int, keys: Keys | None) -> zmq.Socket[Any]:
-    """A ROUTER socket that listens.
-
-    Raises:
-        ConfigError: The address cannot be used.
-    """
+def server_socket(context: zmq.Context[Any], address: str, keys: Keys | None) -> zmq.Socket[Any]:
+    """A ROUTER socket that listens at an address of this computer only, as ZeroMQ writes it."""
     import zmq
 
     socket = context.socket(zmq.ROUTER)
     _limit(socket)
-    socket.set(zmq.HANDSHAKE_IVL, 2000)  # ms for a client to show its key
+    socket.set(zmq.HANDSHAKE_IVL, round(1e3 * HANDSHAKE_S))
+    socket.set(zmq.RCVHWM, MAX_WAITING)
+    socket.set(zmq.SNDHWM, MAX_WAITING)
     if keys is not None:
         socket.zap_domain = b"labseq"
         socket.curve_server, socket.curve_secretkey = True, keys.secret
-    try:
-        socket.bind(endpoint(host, port))
-    except zmq.ZMQError as error:
-        socket.close()
-        hint = "choose another one with --bind; perhaps the server is already running"
-        raise ConfigError(Problem(f"{host}:{port} cannot be used: {error.strerror}", hint=hint)) from error
+    socket.bind(address)
     return socket
 
 
@@ -123,13 +117,12 @@ class Connections:
 
     def __init__(self, socket: zmq.Socket[Any]) -> None:
         import zmq
+        from zmq.utils.monitor import recv_monitor_message  # now: later no file may be left to open
 
+        self._receive_event = recv_monitor_message
         self._socket = socket
-        self._endpoint: Any = socket.get(zmq.LAST_ENDPOINT)
-        self._is_listening = True
         self._events = socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
         self._n_before: Counter[int] = Counter()
-        self._open: set[int] = set()
         self._ended: set[tuple[int, int]] = set()
 
     def named(self, number: int) -> tuple[int, int]:
@@ -143,32 +136,16 @@ class Connections:
         ended, self._ended = self._ended, set()
         return ended
 
-    def limit(self, limit: int = MAX_CONNECTIONS) -> None:
-        """Stop listening at ``limit`` connections, and listen again below half as many."""
-        import zmq
-
-        self._read()
-        with suppress(zmq.ZMQError):  # the port is not free again yet
-            if self._is_listening and len(self._open) >= limit:
-                self._socket.unbind(self._endpoint)
-                self._is_listening = False
-            elif not self._is_listening and len(self._open) < limit / 2:
-                self._socket.bind(self._endpoint)
-                self._is_listening = True
-
     def _read(self) -> None:
         import zmq
-        from zmq.utils.monitor import recv_monitor_message
 
         while self._events.poll(0):
-            event = recv_monitor_message(self._events)
+            event = self._receive_event(self._events)
             number = int(event["value"])
             if event["event"] == zmq.EVENT_DISCONNECTED:
                 self._ended.add((number, self._n_before[number]))
-                self._open.discard(number)
             else:
                 self._n_before[number] += 1
-                self._open.add(number)
 
     def close(self) -> None:
         """Stop watching; call it before the socket is closed."""

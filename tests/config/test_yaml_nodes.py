@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, cast
 
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from labseq.config.document import Document
 from labseq.config.yaml_nodes import MAX_DEPTH, MAX_VALUES, compose, resolve
@@ -53,6 +53,16 @@ def test_aliases_are_replaced_by_their_values() -> None:
 def test_all_that_can_be_found_is_reported() -> None:
     places = [line.split(": ")[0] for line in problems("a: !x 1\nb: 1\nb: 2\n<<: {}\n3: 4\nc: [\n")]
     assert places == [f"f.yaml:{place}" for place in ("1:4", "3:1", "4:1", "5:1", "6:4")]
+
+
+@given(st.text("{}[],:;-?&*a' \n", max_size=24))
+@example("{}[")  # a bracket that opens after the document's end
+@example("{;,{2,{}}")  # a mapping as a key of a mapping that is a key itself
+def test_brackets_in_any_order_are_a_value_or_an_error_with_its_place(text: str) -> None:
+    try:
+        compose(text, "f.yaml")
+    except ConfigError as error:
+        assert all(problem.line and problem.column for problem in error.problems)
 
 
 def test_nesting_up_to_the_limit() -> None:

@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -202,6 +203,16 @@ def test_a_shot_that_cannot_be_read_is_left_out_and_reported(taken, tmp_path):
     found = replay(open_run(folder), ReplayRequest())
     assert (found.n_shots, list(found.unreadable)) == (3, [1])
     assert not found.is_reproduced
+
+
+def test_a_shot_with_two_frames_of_an_image_is_left_out_and_reported(taken, tmp_path):
+    folder = shutil.copytree(taken.path, tmp_path / taken.path.name)
+    with h5py.File(open_run(folder).shots[1].file, "r+") as file:
+        file["entry/camera/camera/image"][:] = 0
+    found = replay(open_run(folder), ReplayRequest())
+    assert list(found.unreadable) == [1]
+    assert "two frames of image 0" in found.unreadable[1]
+    assert found.n_shots == 3
 
 
 def test_calibrations_come_from_the_run_s_own_folder(tmp_path):

@@ -116,6 +116,12 @@ def test_names_that_are_not_the_servers_are_refused(host: str, status: int, tmp_
     assert client_of(tmp_path, names=frozenset({"lab"})).get("/api/v1/server", host="lab").status_code == 200
 
 
+@pytest.mark.parametrize("origin", ["http://[", "http://[::1", "//[x]"])
+def test_an_origin_that_is_no_address_is_malformed(tmp_path: Path, origin: str) -> None:
+    answer = client_of(tmp_path, may_act=True).get("/api/v1/server", origin=origin)
+    assert answer.status_code == 400
+
+
 def test_other_pages_cannot_read_or_act(tmp_path: Path) -> None:
     client = client_of(tmp_path, may_act=True)
     other = {"origin": "http://evil.example"}

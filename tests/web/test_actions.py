@@ -137,6 +137,17 @@ def test_the_form_has_every_value_with_what_the_schema_says() -> None:
     assert not [one for one in fields if "plugin" in one or one in ("profile", "name", "planner.use")]
 
 
+def test_targets_are_drawn_and_never_named_by_a_path() -> None:
+    """The answer of a check would tell which files the computer has."""
+    host = load_plugins()
+    host.import_all()
+    schema = json.loads(json.dumps(file_schema("sequence", host.registry)))
+    data = {"target": {"pattern": "bitmap", "file": "mine.txt"}, "shot": [{"load": {}}]}
+    fields = {one["address"] for one in form_fields(data, schema)}
+    assert "target.sites" in fields
+    assert "target.file" not in fields
+
+
 def test_a_known_sequence_is_queued_with_values_of_its_form(
     acting: Client, monkeypatch: pytest.MonkeyPatch, run_dir: Path
 ) -> None:
@@ -164,6 +175,10 @@ def test_a_known_sequence_is_queued_with_values_of_its_form(
         values | {"changes": {"plugin_folders": "[/tmp]"}},
         values | {"changes": {"profile.camera.use": "virtual"}},
         values | {"changes": [1]},
+        values | {"changes": {"target.file": "/etc/passwd"}},
+        values | {"changes": {"shots": "{pattern: bitmap, file: /etc/passwd}"}},
+        values | {"changes": {"shots": "&a {pattern: bitmap, file: /etc/passwd}"}},
+        values | {"changes": {"shots": {"file": "/etc/passwd"}}},
     ):
         assert acting.post("/api/v1/queue/add", wrong).status_code == 409
     assert len(called) == n

@@ -1,0 +1,93 @@
+"""Limits of connections, which hold before a request reaches the application and its guard.
+
+uvicorn reads headers of any length for any time, and counts idle connections as requests.
+"""
+
+from __future__ import annotations
+
+import time
+from asyncio import TimerHandle, Transport
+from collections import Counter
+from operator import attrgetter
+from typing import Any, Final
+
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+MAX_HEADERS: Final = 16 << 10
+"""Largest request line with all headers, in bytes."""
+MAX_REQUEST: Final = 128 << 10
+"""Largest request, in bytes; the bodies that the API takes are smaller."""
+REQUEST_S: Final = 10.0
+"""Longest time from the first byte of a request, or the connection, to its last byte, in seconds."""
+MAX_IDLE: Final = 192
+"""Maximum number of connections without a request in progress; of more, the oldest is closed."""
+MAX_IDLE_OF_ADDRESS: Final = 48
+"""The same for one address; a browser has six."""
+
+
+class LimitedProtocol(HttpToolsProtocol):
+    """A connection of a browser, with limits.
+
+    Attributes:
+        since_s: When it was made.
+        is_idle: Whether it has no request in progress; one whose headers are coming is none.
+    """
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        super().__init__(*args, **named)
+        self.since_s: float = time.monotonic()
+        self.is_idle = True
+        self._n_bytes = 0  # of the request that is coming
+        self._has_headers = False
+        self._late: TimerHandle | None = None
+
+    @property
+    def address(self) -> str:
+        """Address of the browser."""
+        return self.client[0] if self.client else ""
+
+    def connection_made(self, transport: Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Count the connection, and close another one if there are too many."""
+        super().connection_made(transport)
+        self._late = self.loop.call_later(REQUEST_S, transport.abort)
+        peers = [peer for peer in self.connections if isinstance(peer, LimitedProtocol)]
+        idle = sorted((peer for peer in peers if peer.is_idle), key=attrgetter("since_s"))
+        ((address, most),) = Counter(peer.address for peer in idle).most_common(1)
+        if most > MAX_IDLE_OF_ADDRESS or len(idle) > MAX_IDLE:
+            next(peer for peer in idle if peer.address == address).transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the connection."""
+        self._end_wait()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Read on, unless the request is too long."""
+        if self._late is None:
+            self._late = self.loop.call_later(REQUEST_S, self.transport.abort)
+        self._n_bytes += len(data)
+        super().data_received(data)
+        is_long = self._n_bytes > (MAX_REQUEST if self._has_headers else MAX_HEADERS)
+        if is_long and not self.transport.is_closing():
+            self.send_400_response("The request is too long.")
+
+    def on_headers_complete(self) -> None:
+        """Begin to answer."""
+        self._has_headers, self.is_idle = True, False
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        """The request has come, in time."""
+        self._end_wait()
+        self._n_bytes, self._has_headers = 0, False
+        super().on_message_complete()
+
+    def on_response_complete(self) -> None:
+        """Wait for the next request."""
+        super().on_response_complete()
+        self.is_idle = self.cycle.response_complete
+
+    def _end_wait(self) -> None:
+        if self._late is not None:
+            self._late.cancel()
+            self._late = None

@@ -1,0 +1,186 @@
+"""What a stranger at a port, or a client with wrong messages, can cost: its message or its connection."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import zmq
+from labseq_remote.connection import served_context
+from labseq_remote.drivers import RemoteDevice
+from labseq_remote.settings import RemoteSettings
+
+from labseq import wire
+from labseq.guard import StopFlag
+from labseq.plugin import Context, SiteGrid
+from labseq.sequencer.clock import RealClock
+from labseq.testing.fakes import FakeClock
+from labseq.wire import messages
+from tests.remote.conftest import PROFILE, Served, free_port
+from tests.remote.fuzz import _begin
+
+KINDS: dict[str, Any] = {
+    "array": np.zeros(3),
+    "empty array": np.zeros(0),
+    "mapping": {"a": np.zeros(2)},
+    "list": [np.zeros(2), "x"],
+    "text": "x",
+    "number": 7,
+    "tuple": (np.zeros(2),),
+    "grid": SiteGrid(2, 3),
+}
+HELLO = {"op": "hello", "labseq": "x", "who": "x", "device": "instrument", "kind": "device"}
+REQUESTS: dict[str, dict[str, Any]] = {
+    "hello": {**HELLO, "protocol": wire.PROTOCOL},
+    "beat": {"op": "beat"},
+    "abort": {"op": "abort", "number": 0},
+}
+
+
+@contextmanager
+def connected(port: int) -> Generator[Any]:
+    with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
+        peer.linger = 0
+        peer.connect(f"tcp://127.0.0.1:{port}")
+        yield peer
+
+
+def ask(peer: Any, message: Any) -> Any:
+    """The reply to a message."""
+    peer.send_multipart(wire.pack(message))
+    assert peer.poll(10_000), f"no reply to {message}"
+    return wire.unpack(peer.recv_multipart())
+
+
+def wrong_values(fields: dict[str, Any]) -> Generator[tuple[str, Any]]:
+    """Each field with each value of another type than its own."""
+    for field, right in fields.items():
+        yield from ((field, value) for value in KINDS.values() if type(value) is not type(right))
+
+
+@pytest.mark.parametrize("request_", REQUESTS)
+def test_a_field_of_a_wrong_type_costs_its_message_only(server: Served, request_: str) -> None:
+    with connected(server.port) as control:
+        token = _begin(control, "instrument", "device")
+        message = {"n": 5, **REQUESTS[request_]} | ({} if request_ == "hello" else {"session": token})
+        for field, value in wrong_values(message):
+            reply = ask(control, {**message, field: value})
+            assert "cannot read a message" in reply["error"]["text"], (field, value)
+        for value in KINDS.values():
+            assert "cannot read a message" in ask(control, value)["error"]["text"]
+        assert ask(control, {"session": token, "n": 6, "op": "beat"})["value"]["running"] is False
+
+
+def test_a_context_of_a_wrong_type_is_refused(server: Served) -> None:
+    context = served_context("laser", Context("laser", SiteGrid(6, 7), clock=FakeClock()))
+    wrong: list[Any] = [{**context, field: value} for field, value in wrong_values(context)]
+    wrong += [{**context, "lines": [np.zeros(2)]}, {**context, "calibrations": {"a": np.zeros(2)}}]
+    with connected(server.port) as control, connected(server.port + 5) as device:
+        for arguments in [*([context] for context in wrong), *([value] for value in KINDS.values())]:
+            token = _begin(control, "instrument", "device")
+            message = {"session": token, "n": 1, "call": "attach", "args": arguments, "named": {}}
+            assert "context" in ask(device, message)["error"]["text"]
+
+
+def array(place: list[int], dtype: str, shape: list[int]) -> msgpack.ExtType:
+    return msgpack.ExtType(1, _packed([place, dtype, shape, {}]))
+
+
+def _packed(value: Any) -> bytes:
+    packed: Any = msgpack.packb(value)
+    return packed
+
+
+def announced_lists() -> list[bytes]:
+    """Lists in lists that announce 65,535 items each, which do not come."""
+    lists = b"\xdd\x00\x00\xff\xff" * 500
+    message = lists
+    for _ in range(15):
+        message = lists + _packed(msgpack.ExtType(3, message))
+    return [message]
+
+
+GREEDY: dict[str, list[bytes]] = {
+    "one part in many arrays": [_packed([array([1, 1], "<f8", [1 << 17])] * 60), bytes((1 << 20) + 9)],
+    "parts that overlap": [_packed([array([1, i + 1], "<f8", [1 << 17]) for i in range(60)]), bytes(1 << 21)],
+    "items without bytes": [_packed(array([1, 0], "|S0", [1 << 28])), b"x"],
+    "text without bytes": [_packed(array([1, 0], "<U0", [1 << 28])), b"x"],
+    "an endless empty array": [_packed(array([1, 0], "<f8", [1 << 40, 0])), b"x"],
+    "announced lists": announced_lists(),
+    "large grids": [
+        _packed([msgpack.ExtType(2, _packed(["SiteGrid", [1000, 1000, 1, "square", 1, [], []]]))] * 9)
+    ],
+    "an endless grid": [
+        _packed(msgpack.ExtType(2, _packed(["SiteGrid", [1 << 40, 1, 1, "square", 1, [], []]])))
+    ],
+}
+
+
+@pytest.mark.parametrize("parts", GREEDY.values(), ids=GREEDY)
+def test_no_message_takes_more_memory_than_a_few_times_its_size(parts: list[bytes]) -> None:
+    grid_bytes = 16 * messages.MAX_SITES
+    tracemalloc.start()
+    try:
+        with pytest.raises(wire.MessageError):
+            wire.unpack(parts)
+        assert tracemalloc.get_traced_memory()[1] < 4 * (sum(map(len, parts)) + grid_bytes)
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_message_of_too_many_bytes_in_all_is_refused() -> None:
+    part = bytes(messages.MAX_PART)
+    with pytest.raises(wire.MessageError, match="expected at most"):
+        wire.unpack([_packed(0), *[part] * 5])
+    with pytest.raises(wire.MessageError, match="256 MiB in all"):
+        wire.pack([np.frombuffer(part, np.uint8)] * 5)
+
+
+SERVE = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_NOFILE, (512, 512))
+from labseq.__main__ import main
+sys.argv[0] = "labseq"
+main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="connections are not files there")
+def test_strangers_without_a_key_leave_files_for_devices(tmp_path: Path, keys: Path) -> None:
+    path, port = tmp_path / "served.yaml", free_port(8)
+    path.write_text(PROFILE, encoding="utf-8")
+    command = [sys.executable, "-c", SERVE, "serve-devices", str(path), "--bind", f"tcp://127.0.0.1:{port}"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        assert process.stdout is not None
+        assert any("control at" in line for line in process.stdout)
+        settings = RemoteSettings(device="instrument", address=f"tcp://127.0.0.1:{port}", server_key="here")
+        device = RemoteDevice(settings, Context("laser", clock=RealClock(StopFlag())))
+        device.open()
+        strangers = [socket.socket() for _ in range(1200)]
+        most = 0
+        try:
+            for number, stranger in enumerate(strangers):
+                stranger.setblocking(False)
+                stranger.connect_ex(("127.0.0.1", port + number % 6))
+                if sys.platform == "linux" and number % 50 == 0:
+                    most = max(most, len([*Path(f"/proc/{process.pid}/fd").iterdir()]))
+            for _ in range(20):
+                device.command("open")
+            assert most < 400
+        finally:
+            for stranger in strangers:
+                stranger.close()
+            with suppress(Exception):
+                device.close()
+            process.terminate()
+        assert process.communicate(timeout=30)[0].count("error:") == 0
+        assert process.returncode == 0
