@@ -54,6 +54,8 @@ class LeaderDevice(Device):
         ConfigError: The settings load atoms, but no lab is simulated.
     """
 
+    any_thread = True  # asked for an abort between a frame and its moves, where another thread costs 0.1 ms
+
     def __init__(self, settings: LinkSettings, context: Context, link: Link) -> None:
         if settings.loads and context.simulation is None:
             raise ConfigError("'loads' is for a simulated lab, and this one is real; remove it")
@@ -102,6 +104,7 @@ class LeaderDevice(Device):
         self._ending.set()
         if self._thread is not None:
             self._thread.join()
+        self._handle(("came", self._link.finish()))
         with self._changed:
             self._send(self._dialogue.end())
         self._link.close()

@@ -70,6 +70,10 @@ class Link:
     def send(self, line: bytes) -> None:
         """Send a line; from any thread."""
 
+    def finish(self) -> bytes:
+        """Receive nothing more; returns the bytes of which ``poll`` has not told yet."""
+        return b""
+
     def close(self) -> None:
         """Close the connection; ``poll`` is not called any more."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -14,6 +15,8 @@ from labseq_follow.relay import ANSWERED
 
 MAX_LINE: Final = SHORT_LINE
 """Longest line in bytes that a control system sends; more is noise."""
+MARKED: Final = re.compile(rf"{ANSWERED.decode()}(\d+\.\d+){ANSWERED.decode()}", re.ASCII)
+"""What precedes a `go` that was answered, and the time at which it came."""
 NOT_ANSWERED: Final = "error"
 """Lines that begin so are never answered, or two programs could exchange errors forever."""
 
@@ -95,10 +98,11 @@ class Dialogue:
 
     def receive_line(self, received: str, now_s: float) -> list[str]:
         """Handle a line that came; a `go` after the mark of :mod:`labseq_follow.relay` was answered."""
-        is_answered = received.startswith(ANSWERED.decode())
-        word, _, text = received.removeprefix(ANSWERED.decode()).strip().partition(" ")
+        answered = MARKED.match(received)
+        word, _, text = received[answered.end() if answered else 0 :].strip().partition(" ")
         if word == GO:
-            return self._receive_go(text.strip(), now_s, is_answered=is_answered)
+            came_s = min(now_s, float(answered[1])) if answered else now_s
+            return self._receive_go(text.strip(), came_s, is_answered=answered is not None)
         if word == "abort" and not text:
             return self._abort()
         if word == "state?" and not text:
@@ -156,11 +160,11 @@ class Dialogue:
         go, self._go = self._go, None
         return [] if go is None or go.answered else [self._failed("labseq ends")]
 
-    def _receive_go(self, text: str, now_s: float, *, is_answered: bool) -> list[str]:
+    def _receive_go(self, text: str, came_s: float, *, is_answered: bool) -> list[str]:
         if self._go is not None:
             self.log.note_refused()
             return [self._failed("busy")]
-        self._go = _Go(visible(text), now_s, now_s + self._deadline_s)
+        self._go = _Go(visible(text), came_s, came_s + self._deadline_s)
         return [] if is_answered else [self._line("busy")]
 
     def _abort(self) -> list[str]:

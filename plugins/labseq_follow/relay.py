@@ -13,11 +13,12 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from typing import Final
 
 ANSWERED: Final = b"\x06"
-"""Precedes a `go` that was answered; taken out of what a control system sends."""
+"""Stands around the time at which a `go` came that was answered; taken out of what a control system sends."""
 LONGEST: Final = 200
 """More than this without a line feed is passed on as it is; the run says that the line is too long."""
 EXIT_S: Final = 2.0
@@ -51,6 +52,16 @@ class Relay:
             self._answer = answer
             with suppress(OSError):  # it has ended, which is seen at ``received``
                 self.received.send(answer or b"\n")
+
+    def finish(self) -> bytes:
+        """Answer nothing more; returns what was received, and perhaps answered, but not yet read."""
+        rest = b""
+        with suppress(OSError):
+            self.received.shutdown(socket.SHUT_WR)
+            self.received.settimeout(EXIT_S)
+            while data := self.received.recv(4096):
+                rest += data
+        return rest
 
     def close(self) -> None:
         """End the process."""
@@ -95,7 +106,8 @@ def _relay(run: socket.socket, leader: socket.socket) -> None:
             if answer and line.split(b" ")[0].strip() == b"go" and len(line) <= LONGEST:
                 with suppress(OSError):
                     leader.send(answer + b"\n")
-                answer, mark = b"", ANSWERED
+                # the run may read it much later; a monotonic time is the same in all processes
+                answer, mark = b"", b"%s%.6f%s" % (ANSWERED, time.monotonic(), ANSWERED)
             run.sendall(mark + line + b"\n")
         if begun and (not came or len(begun) > LONGEST):
             run.sendall(begun)

@@ -107,6 +107,10 @@ class TcpLink(Link):
                     self._leader.shutdown(socket.SHUT_RDWR)  # after half a line nothing more may follow
                 raise ConnectionError("it does not read; its connection was closed")
 
+    def finish(self) -> bytes:
+        """End the receiving: the process beside the run may have answered a `go` that is not known here."""
+        return b"" if self._relay is None or self._leader is None else self._relay.finish()
+
     def close(self) -> None:
         """Disconnect, and stop listening."""
         self._drop()

@@ -161,6 +161,7 @@ def test_go_is_answered_while_the_run_is_too_busy_to_look() -> None:
 def test_where_no_process_can_share_the_socket_the_run_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("labseq_follow.tcp.can_relay", lambda: False)
     with led() as (device, peer):
+        assert peer.ask("\x06soon\x06go 0").startswith("error what is"), "as the process would mark it"
         assert [peer.ask("go 1"), peer.ask("go 2")] == ["busy", "failed reason=busy"]
         assert device.wait_for("go", 20.0) == "1"
         peer.leave()
