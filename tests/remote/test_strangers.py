@@ -22,6 +22,7 @@ from labseq_remote.settings import RemoteSettings
 from labseq import wire
 from labseq.guard import StopFlag
 from labseq.plugin import Context, SiteGrid
+from labseq.remote import gate
 from labseq.sequencer.clock import RealClock
 from labseq.testing.fakes import FakeClock
 from labseq.wire import messages
@@ -143,6 +144,26 @@ def test_a_message_of_too_many_bytes_in_all_is_refused() -> None:
         wire.unpack([_packed(0), *[part] * 5])
     with pytest.raises(wire.MessageError, match="256 MiB in all"):
         wire.pack([np.frombuffer(part, np.uint8)] * 5)
+
+
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(48)
+READY = b"\x04\x1c\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER"
+MORE = b"\x03" + (1 << 20).to_bytes(8, "big") + bytes(1 << 20)
+"""A part of a message that others follow; see the protocol ZMTP 3.0."""
+
+
+def test_a_message_whose_parts_do_not_end_is_cut_off(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "MAX_UNANSWERED", 4 << 20)
+    n_sent = 0
+    with connected(server.port) as other, socket.create_connection(("127.0.0.1", server.port)) as endless:
+        endless.settimeout(60.0)
+        with suppress(ConnectionError):
+            endless.sendall(GREETING + READY)
+            while n_sent < 64:
+                endless.sendall(MORE)
+                n_sent += 1
+        assert 3 < n_sent < 32
+        assert "error" in ask(other, {"n": 1, "op": "nonsense"})
 
 
 SERVE = """
