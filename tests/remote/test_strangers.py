@@ -102,8 +102,8 @@ def _packed(value: Any) -> bytes:
 
 
 def announced_lists() -> list[bytes]:
-    """Lists in lists that announce 65,535 items each, which do not come."""
-    lists = b"\xdd\x00\x00\xff\xff" * 500
+    """Lists in lists that announce 30,000 items each, which do not come."""
+    lists = b"\xdd\x00\x00\x75\x30" * 500
     message = lists
     for _ in range(15):
         message = lists + _packed(msgpack.ExtType(3, message))
@@ -115,7 +115,7 @@ GREEDY: dict[str, list[bytes]] = {
     "parts that overlap": [_packed([array([1, i + 1], "<f8", [1 << 17]) for i in range(60)]), bytes(1 << 21)],
     "items without bytes": [_packed(array([1, 0], "|S0", [1 << 28])), b"x"],
     "text without bytes": [_packed(array([1, 0], "<U0", [1 << 28])), b"x"],
-    "an endless empty array": [_packed(array([1, 0], "<f8", [1 << 40, 0])), b"x"],
+    "an endless empty array": [_packed(array([1, 0], "<f8", [1 << 30, 0])), b"x"],
     "announced lists": announced_lists(),
     "large grids": [
         _packed([msgpack.ExtType(2, _packed(["SiteGrid", [1000, 1000, 1, "square", 1, [], []]]))] * 9)
@@ -128,7 +128,7 @@ GREEDY: dict[str, list[bytes]] = {
 
 @pytest.mark.parametrize("parts", GREEDY.values(), ids=GREEDY)
 def test_no_message_takes_more_memory_than_a_few_times_its_size(parts: list[bytes]) -> None:
-    grid_bytes = 16 * messages.MAX_SITES
+    grid_bytes = 16 * messages.MAX_SITES if b"SiteGrid" in parts[0] else 1 << 20
     tracemalloc.start()
     try:
         with pytest.raises(wire.MessageError):
@@ -186,14 +186,20 @@ def test_strangers_without_a_key_leave_files_for_devices(tmp_path: Path, keys: P
         settings = RemoteSettings(device="instrument", address=f"tcp://127.0.0.1:{port}", server_key="here")
         device = RemoteDevice(settings, Context("laser", clock=RealClock(StopFlag())))
         device.open()
-        strangers = [socket.socket() for _ in range(1200)]
+        strangers = [socket.socket() for _ in range(800)]
         most = 0
         try:
             for number, stranger in enumerate(strangers):
-                stranger.setblocking(False)
-                stranger.connect_ex(("127.0.0.1", port + number % 6))
+                stranger.settimeout(0.1)
+                with suppress(OSError):
+                    stranger.connect(("127.0.0.1", port + number % 6))
                 if sys.platform == "linux" and number % 50 == 0:
                     most = max(most, len([*Path(f"/proc/{process.pid}/fd").iterdir()]))
+            for stranger in strangers:
+                stranger.settimeout(60.0)
+                with suppress(OSError):
+                    while stranger.recv(1 << 10):  # until the server ends it
+                        pass
             for _ in range(20):
                 device.command("open")
             assert most < 400
