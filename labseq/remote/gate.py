@@ -16,13 +16,20 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, Final
 
 from labseq.errors import ConfigError, Problem
 from labseq.wire import HANDSHAKE_S, parse_address
+from labseq.wire.messages import MAX_MESSAGE
 
 _SIZE: Final = 1 << 18
 """Bytes that are passed on at a time."""
+MAX_UNANSWERED: Final = MAX_MESSAGE + (1 << 20)
+"""Bytes that a client may send before it gets an answer, and a quarter of those of all clients together.
+
+ZeroMQ keeps a message of any number of parts until its last one has come.
+"""
 _BEFORE_KEY: Final = 64 + 170 + 12
 """Bytes that ZeroMQ sends to a client whose key it does not know: greeting, WELCOME, ERROR (ZMTP 3.1, CURVE).
 READY, for one that it knows, is longer than ERROR."""
@@ -48,6 +55,7 @@ class _Connection:
         address: The client's address.
         until_s: When it has to have shown its key (without keys: spoken ZeroMQ); 0 for one that has.
         n_sent: Number of bytes that ZeroMQ has sent to it.
+        n_unanswered: Number of bytes that have come from it since then.
     """
 
     client: _Side
@@ -55,6 +63,7 @@ class _Connection:
     address: str
     until_s: float
     n_sent: int = 0
+    n_unanswered: int = 0
 
 
 class Gate:
@@ -223,13 +232,27 @@ class Gate:
         if n == 0:
             raise ConnectionResetError
         if side is connection.server:
-            connection.n_sent += n
+            connection.n_sent, connection.n_unanswered = connection.n_sent + n, 0
             if connection.n_sent > self._before_key:
                 connection.until_s = 0.0
+        else:
+            connection.n_unanswered += n
+            self._limit_unanswered(connection)
         n_sent = 0
         with suppress(BlockingIOError):
             n_sent = other.socket.send(self._buffer[:n])
         other.waiting = memoryview(bytes(self._buffer[n_sent:n]))
+
+    def _limit_unanswered(self, connection: _Connection) -> None:
+        """Close a connection that sends too much; of all together too much, the one that sent most."""
+        in_all = sum(peer.n_unanswered for peer in self._open)
+        if connection.n_unanswered <= MAX_UNANSWERED and in_all <= 4 * MAX_UNANSWERED:
+            return
+        most = max(self._open, key=attrgetter("n_unanswered"))
+        self._refuse(most.address, f"it sent {most.n_unanswered >> 20} MiB without waiting for an answer")
+        if most is connection:
+            raise ConnectionAbortedError
+        self._close(most)
 
     def _watch(self, connection: _Connection) -> None:
         """Read from a socket only while the other one takes what comes, so that nothing piles up."""
