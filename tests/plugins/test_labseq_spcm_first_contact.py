@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from labseq_spcm.first_contact import SpcmFirstContact
+from labseq_spcm.first_contact_verdict import judge
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import (
@@ -87,7 +88,7 @@ def with_faults(faults: Faults = Faults(), model: CardModel = M4I6631) -> Callab
 
 
 ALONE = ("identity", "times", "positions", "write_speed", "lag", "sustained", "starve", "threads")
-UNSEEN = "not measured: overwrite"
+UNSEEN = "the certificate needs the step overwrite with an oscilloscope"
 
 
 @pytest.mark.parametrize(
@@ -173,6 +174,10 @@ class TestScope:
             verdict = lab.contact.judge({**measured, "overwrite": result | readings})
         assert len(bursts) == (0 if copies else 20)
         assert verdict["stream"] is not copies
+        faster = SpcmSettings(sample_rate=625e6, card_buffer=1 << 17)
+        later = judge({**measured, "overwrite": result | readings}, faster)
+        assert "overwrite measured with another sample_rate" in later["reason"]
+        assert not later["stream"], "a certificate is not carried over to other settings"
         if copies:
             assert "0 of 20 bursts" in verdict["reason"]
         else:
@@ -342,4 +347,4 @@ def test_the_command_that_is_killed_while_an_output_is_on_leaves_the_card_off(
     until(lambda: not outputs_on())
     assert instrument[0]("state") == (False, (False, False))
     instrument[0].close()
-    assert not (tmp_path / "data").exists(), "nothing was measured"
+    assert not list((tmp_path / "data").rglob("*.json")), "nothing was measured"
