@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final, TypeAlias
 
+from pydantic import ValidationError
+
 from labseq.plugin import format_quantity
 from labseq_spcm.limits import FRAME_BYTES, RATE_STEP_HZ
 from labseq_spcm.settings import SpcmSettings
@@ -30,7 +32,10 @@ def _write_speed(result: Result, settings: SpcmSettings) -> str:
     speeds = {int(size): float(speed) for size, speed in result["user"]}
     speed = speeds.get(settings.notify_size, 0.0)
     enough = [size for size, speed in speeds.items() if speed >= needed and size <= LARGEST_NOTIFY_BYTES]
-    hint = f"notify_size {min(enough)} is enough" if enough else "no notify size is enough"
+    hint = "no notify size is enough"
+    if enough:
+        size = min(enough)
+        hint = f"notify_size {size} with card_buffer {max(2 * size, settings.card_buffer)} is enough"
     text = f"blocks of {settings.notify_size >> 10} KiB are written at {speed / 1e9:.3g} GB/s"
     return f"{text}, and the sample rate needs {needed / 1e9:.3g} ({hint})" if speed < needed else ""
 
@@ -165,6 +170,7 @@ def judge(measured: Mapping[str, Result], settings: SpcmSettings) -> dict[str, A
     present = streamed(settings)
     valid = {step: result for step, result in results.items() if result.get("settings") == present}
     against = [text for step, claim in STREAM if step in valid and (text := claim(valid[step], settings))]
+    against += _refused(settings)
     missing = dict.fromkeys(step for step, _ in STREAM if step not in valid)
     against += [_missing(list(missing), [step for step in missing if step in results])] if missing else []
     others = list(_others(measured, results, settings))
@@ -178,6 +184,15 @@ def judge(measured: Mapping[str, Result], settings: SpcmSettings) -> dict[str, A
 def streamed(settings: SpcmSettings) -> dict[str, Any]:
     """The settings for which a certificate is valid; steps record those with which they measured."""
     return settings.model_dump(include={"sample_rate", "notify_size", "card_buffer"})
+
+
+def _refused(settings: SpcmSettings) -> list[str]:
+    """Why the driver refuses the mode ``stream`` with settings that another mode takes."""
+    try:
+        SpcmSettings.model_validate(settings.model_dump() | {"mode": "stream", "trigger": "software"})
+    except ValidationError as error:
+        return [detail["msg"].removeprefix("Value error, ") for detail in error.errors()]
+    return []
 
 
 def _missing(steps: Sequence[str], outdated: Sequence[str]) -> str:

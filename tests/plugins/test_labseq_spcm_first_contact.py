@@ -184,6 +184,14 @@ class TestScope:
             assert {span.amplitude_v for span in bursts} == {0.08}
             assert min(lengths_s) == pytest.approx(BLOCK_S, rel=0.01)
 
+    def test_settings_that_a_stream_refuses_get_no_certificate(self) -> None:
+        settings = SpcmSettings(card="simulated", notify_size=1 << 19)
+        reason = judge({}, settings)["reason"]
+        assert "card_buffer is 131072; expected at least twice notify_size, 1048576" in reason
+        with met(with_faults(Faults(write_speeds=MANUAL_SPEEDS)), sample_rate=320e6) as lab:
+            reason = lab.contact.judge(lab.take("write_speed"))["reason"]
+        assert "(notify_size 524288 with card_buffer 1048576 is enough)" in reason
+
     def test_the_trigger_step_plays_at_each_edge_and_its_delay_is_compared(self) -> None:
         with met(keep_history=True) as lab:
             start_s = lab.clock.now()
