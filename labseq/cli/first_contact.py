@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -49,10 +49,6 @@ def meet(
     dialogue = _Terminal(instruments, asks=not yes)
     with announcing(report_compiling):
         contacts = meet_devices(profile, wanted, overrides, dry_run, dialogue, _warn)
-    for contact in contacts:
-        page = contact.path.with_suffix(".md")
-        write_text(page, page_text(contact))
-        say("", *_summary(contact, page))
     return DeviceError.exit_code if any(contact.failed for contact in contacts) else 0
 
 
@@ -112,6 +108,12 @@ class _Terminal:
         else:
             say("  done; the outputs are off")
 
+    def written(self, contact: Contact) -> None:
+        """Write the page, and say where it is and what follows."""
+        page = contact.path.with_suffix(".md")
+        write_text(page, page_text(contact))
+        say("", *_summary(contact, page))
+
 
 def _quantity(value: float, dimension: str) -> str:
     return f"{value:g}" if dimension == "fraction" else format_quantity(value, dimension)
@@ -136,7 +138,9 @@ def _answer(question: str, stop: StopFlag) -> str:
         say("")  # the next line does not begin behind the question
         raise
     if not lines or not lines[0]:
-        raise ConfigError("there is no terminal that could answer; give --yes, and --with for instruments")
+        say("")  # nor does the error
+        hint = "give --yes, and --with for instruments; what they show is typed at a terminal"
+        raise ConfigError(f"there is no terminal that could answer; {hint}")
     return lines[0].strip()
 
 
@@ -172,33 +176,68 @@ def page_text(contact: Contact) -> str:
     if "stream" in content["verdict"]:
         lines += ["", f"Mode `stream`: {'yes' if content['verdict']['stream'] else 'no'}."]
     for step, result in content["measured"].items():
-        lines += ["", f"## {step}", "", *_table(_rows(result))]
+        lines += ["", f"## {step}", "", *_table(_rows(result, contact.units))]
     lines += [
         "",
-        f"Numbers are in SI units. The file beside this page, `{contact.path.name}`, is what labseq",
+        f"The file beside this page, `{contact.path.name}`, has all digits, in SI units. labseq reads it.",
     ]
-    return "\n".join([*lines, "reads; it has a digest, and must not be edited.", ""])
+    return "\n".join([*lines, "It has a digest, and must not be edited.", ""])
 
 
-def _table(rows: Sequence[tuple[str, Any]]) -> list[str]:
-    return ["| | |", "|---|---|", *(f"| {key} | {_cell(value)} |" for key, value in rows)]
+def _table(rows: Sequence[tuple[str, str]]) -> list[str]:
+    return ["| | |", "|---|---|", *(f"| {label} | {cell} |" for label, cell in rows)]
 
 
-def _rows(result: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    rows: list[tuple[str, Any]] = []
+def _rows(
+    result: Mapping[str, Any], units: Mapping[str, Sequence[str]], prefix: str = ""
+) -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
     for key, value in result.items():
+        unit = next((unit for unit in _UNITS if key.endswith(f"_{unit}")), "")
+        words = key.removesuffix(f"_{unit}").split("_")
+        label = prefix + " ".join(_SPELLED.get(word, word) for word in words)
         if isinstance(value, Mapping):
-            rows += _rows(value, f"{prefix}{key}.")
+            rows += _rows(value, units, f"{label}, ")
         else:
-            rows.append((f"{prefix}{key}", value))
+            rows.append((label, _cell(value, units.get(key, (unit,)))))
     return rows
 
 
-def _cell(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.6g}"
+def _cell(value: Any, units: Sequence[str]) -> str:
+    """A result in the units of its columns; a list is one line of a table, or several."""
     if isinstance(value, list):
-        return "; ".join(
-            " ".join(map(_cell, item)) if isinstance(item, list) else _cell(item) for item in value
-        )
-    return "not told" if value is None else str(value).replace("|", "\\|")
+        items: list[Any] = value
+        by_column = len(items) == len(units) > 1 and not isinstance(items[0], list)
+        cells = (_cell(item, units[i : i + 1] if by_column else units) for i, item in enumerate(items))
+        return (", " if by_column else "; ").join(cells) or "none"
+    if value is None:
+        return "not known"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int | float):
+        return _UNITS.get(units[0], "{:.6g}".format)(value)
+    return str(value).replace("|", "\\|")
+
+
+def _size(n_bytes: float) -> str:
+    for unit, factor in (("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10)):
+        if n_bytes and not n_bytes % factor:
+            return f"{n_bytes // factor} {unit}"
+    return f"{n_bytes} bytes"
+
+
+_SPELLED: Final = {"kib": "KiB", "mib": "MiB", "pcie": "PCIe", "dds": "DDS"}
+_UNITS: Final[Mapping[str, Callable[[float], str]]] = {
+    "s_per_byte": lambda value: f"{value * 1e9:.3g} ns per byte",
+    "hz_per_s": "{:.6g} Hz/s".format,
+    "bytes_per_s": lambda value: f"{value / 1e9:.3g} GB/s",
+    "s": lambda value: format_quantity(value, "time"),
+    "hz": lambda value: format_quantity(value, "frequency", 6),
+    "v": lambda value: format_quantity(value, "voltage"),
+    "mv": lambda value: format_quantity(value / 1e3, "voltage"),
+    "c": "{:g} degrees Celsius".format,
+    "deg": "{:.6g} degrees".format,
+    "bytes": _size,
+    "bits": "{:#x}".format,
+}
+"""How the page writes numbers, by the end of their names; an end that contains another one comes first."""

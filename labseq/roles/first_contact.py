@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 from labseq.roles.hardware import Emergency
@@ -61,10 +62,13 @@ class FirstContact(ABC):
     Attributes:
         is_simulated: Whether the device exists only in software.
         steps: The steps in their order.
+        units: Result -> its unit, for the page, where its name does not end in it; of a table one per
+            column. "bits" is for a number whose bits have meanings.
     """
 
     is_simulated: bool = False
     steps: Sequence[ContactStep] = ()
+    units: Mapping[str, Sequence[str]] = MappingProxyType({})
 
     @abstractmethod
     def open(self) -> Mapping[str, Any]:

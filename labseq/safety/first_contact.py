@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, Protocol
 
 import labseq
@@ -13,6 +14,7 @@ from labseq.assembly.options import DryRun, check_dry_run
 from labseq.assembly.profile import ResolvedProfile, resolve_profile
 from labseq.config.addresses import profile_overrides
 from labseq.drivers.first_contact import (
+    FOLDER,
     SCHEMA,
     check_belongs,
     contact_path,
@@ -52,6 +54,10 @@ class Dialogue(Protocol):
         """A step has ended; its result has "failed" or "skipped" if it measured nothing."""
         ...
 
+    def written(self, contact: Contact) -> None:
+        """The file of a device was written, also after a stop or a fault."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class Contact:
@@ -61,16 +67,15 @@ class Contact:
         device: Its name.
         path: The file that was written.
         content: What is in it.
+        units: See :class:`labseq.roles.first_contact.FirstContact`.
+        failed: Names of the steps that were taken and failed.
     """
 
     device: str
     path: Path
     content: Mapping[str, Any]
-
-    @property
-    def failed(self) -> list[str]:
-        """Names of the steps that failed."""
-        return [step for step, result in self.content["measured"].items() if "failed" in result]
+    units: Mapping[str, Sequence[str]]
+    failed: Sequence[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +84,7 @@ class Wanted:
 
     Attributes:
         role: The device; "" for all that are more than virtual.
-        steps: Only these steps; the others keep their earlier results.
+        steps: Only these steps; none: all. Steps that are not taken keep their earlier results.
         data: The data folder.
     """
 
@@ -102,13 +107,17 @@ def meet_devices(
         ConfigError: The profile has an error, there is no such device or step, or an earlier file does not
             belong to the device.
         DeviceError: A device cannot be opened, is another model, is in use, or is not safe after a step.
-        StopRequested: Ctrl-C; the device is safe.
+        RecordingError: The data folder cannot be written; nothing was opened.
+        StopRequested: Ctrl-C; the device is safe, and the steps before that one are in its file.
     """
     check_dry_run(dry_run)
     hardware = resolve_profile(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
     names = _names(hardware, wanted.role)
-    # a simulator shows its outputs to no simulation: what it plays here is not meant for atoms
-    hardware = replace(hardware, chosen={name: hardware.chosen[name] for name in names})
+    _check_writable(wanted.data / FOLDER)
+    hardware = replace(
+        hardware,
+        chosen={name: hardware.chosen[name] for name in (*names, "simulation") if name in hardware.chosen},
+    )
     stop = StopFlag()
     clock = VirtualClock(stop) if hardware.virtual_time else RealClock(stop)
     with ExitStack() as stack:
@@ -117,15 +126,20 @@ def meet_devices(
         constructed, refused = construct_hardware(hardware, clock)
         for error in refused.values():
             raise error
+        simulation = constructed.pop("simulation", None)
         contacts: list[Contact] = []
         for name, device in in_opening_order(constructed):
             if isinstance(device, OffersFirstContact):
-                meeting = _Meeting(name, device.first_contact(), hardware, stop, dialogue, warn)
+                # once more, without the simulation: what a simulator plays here is not meant for atoms
+                alone = replace(hardware, chosen={name: hardware.chosen[name]})
+                offer = construct_hardware(alone, clock)[0][name].first_contact()
+                meeting = _Meeting(name, offer, hardware, stop, dialogue, warn)
                 contacts.append(meeting.hold(wanted))
             else:
                 timeouts = hardware.profile.timeouts
-                *_, checked = check_each_device([(name, device)], timeouts, stop, None, warn)
+                *_, checked = check_each_device([(name, device)], timeouts, stop, simulation, warn)
                 contacts.append(_identity_only(name, device, checked, wanted.data))
+                dialogue.written(contacts[-1])
             stop.check()
     return contacts
 
@@ -144,6 +158,18 @@ def _names(hardware: ResolvedProfile, role: str) -> list[str]:
     return names
 
 
+def _check_writable(folder: Path) -> None:
+    """Make the folder and a file in it: readings of an oscilloscope are not taken twice.
+
+    Raises:
+        RecordingError: One of them cannot be made.
+    """
+    with explained(folder):
+        make_folder(folder)
+        with TemporaryFile(dir=folder):
+            pass
+
+
 def _identity_only(name: str, device: Hardware, checked: CheckedDevice, data: Path) -> Contact:
     """The contact with a device whose driver offers no steps.
 
@@ -160,7 +186,7 @@ def _identity_only(name: str, device: Hardware, checked: CheckedDevice, data: Pa
     card |= {"serial": str(described.get("serial_number") or name), "driver": versions.get("driver", "")}
     measured = {"identity": {**described, "versions": versions, "limits": limits}}
     content = _content(card, measured, {"reason": NO_STEPS}, simulated=False)
-    return _written(name, contact_path(data, f"{name}-{card['serial']}"), content)
+    return _written(name, contact_path(data, f"{name}-{card['serial']}"), content, {}, [])
 
 
 def _content(
@@ -177,11 +203,15 @@ def _content(
     }
 
 
-def _written(name: str, path: Path, content: Mapping[str, Any]) -> Contact:
-    with explained(path):
-        make_folder(path.parent)
+def _written(
+    name: str,
+    path: Path,
+    content: Mapping[str, Any],
+    units: Mapping[str, Sequence[str]],
+    failed: Sequence[str],
+) -> Contact:
     write_contact(path, content)
-    return Contact(name, path, read_contact(path))
+    return Contact(name, path, read_contact(path), units, failed)
 
 
 class _Meeting:
@@ -202,27 +232,57 @@ class _Meeting:
         self._watchdog = Watchdog("labseq first-contact", pulse=stop.pulse)
 
     def hold(self, wanted: Wanted) -> Contact:
-        """Open the device, take the steps, make it safe and close it whatever happens, and write the file."""
+        """Open the device, take the steps, make it safe and close it whatever happens, and write the file.
+
+        Steps that were taken before a stop or a fault are written, too.
+        """
         name, contact, guard = self._name, self._contact, self._guard
         steps = _chosen(contact.steps, wanted.steps)
         load_kernels()
+        taken = dict[str, dict[str, Any]]()
+        error: LabseqError | None = None
         try:
             card = guard.call_despite_stop(name, self._timeouts.call_s, contact.open)
             emergency = guard.call_despite_stop(name, self._timeouts.call_s, contact.emergency)
             if emergency is not None:
                 self._watchdog.add(name, 0, emergency.script, dict(emergency.arguments))
             path = contact_path(wanted.data, str(card["serial"]), simulated=contact.is_simulated)
-            measured = _earlier(path, card) if wanted.steps else {}
+            earlier = _earlier(path, card, must_belong=bool(wanted.steps))
+        except BaseException:
+            self._end()
+            raise
+        try:
             for step in steps:
                 if self._dialogue.may_take(name, step, self._stop):
-                    measured[step.name] = self._take(step)
+                    taken[step.name] = self._take(step)
+        except LabseqError as stopped:
+            error = stopped
         finally:
             unsafe, unclosed = self._end()
-        for error in (unsafe, unclosed):
-            if error is not None:
-                raise error
-        verdict = contact.judge(measured)
-        return _written(name, path, _content(card, measured, verdict, simulated=contact.is_simulated))
+        problem = unsafe or error or unclosed
+        if problem is not None and not taken:
+            raise problem
+        try:
+            return self._write(path, card, earlier, taken)
+        finally:
+            if problem is not None:
+                raise problem
+
+    def _write(
+        self,
+        path: Path,
+        card: Mapping[str, Any],
+        earlier: Mapping[str, dict[str, Any]],
+        taken: Mapping[str, dict[str, Any]],
+    ) -> Contact:
+        """Judge and write what was measured, now and earlier."""
+        contact, measured = self._contact, {**earlier, **taken}
+        measured = {step.name: measured[step.name] for step in contact.steps if step.name in measured}
+        content = _content(card, measured, contact.judge(measured), simulated=contact.is_simulated)
+        failed = [step for step, result in taken.items() if "failed" in result]
+        met = _written(self._name, path, content, contact.units, failed)
+        self._dialogue.written(met)
+        return met
 
     def _take(self, step: ContactStep) -> dict[str, Any]:
         """Take a step, make the device safe, and ask for the readings.
@@ -270,14 +330,24 @@ def _chosen(steps: Sequence[ContactStep], names: Sequence[str]) -> list[ContactS
     return [step for step in steps if not names or step.name in names]
 
 
-def _earlier(path: Path, card: Mapping[str, Any]) -> dict[str, Any]:
+def _earlier(path: Path, card: Mapping[str, Any], *, must_belong: bool) -> dict[str, Any]:
     """The results of an earlier first contact with the same card on this computer; none without a file.
 
+    Args:
+        path: The file.
+        card: What the device is.
+        must_belong: Whether to refuse a file that is not about it, instead of beginning a new one.
+
     Raises:
-        ConfigError: The file was edited, or is about another card or computer.
+        ConfigError: The file was edited, or is about another card, driver, firmware or computer.
     """
     if not path.exists():
         return {}
-    content = read_contact(path)
-    check_belongs(content, card, path)
+    try:
+        content = read_contact(path)
+        check_belongs(content, card, path)
+    except ConfigError:
+        if must_belong:
+            raise
+        return {}
     return dict(content["measured"])

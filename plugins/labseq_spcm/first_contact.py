@@ -15,7 +15,7 @@ from labseq_spcm import (
     first_contact_transfer as transfer,
 )
 from labseq_spcm.first_contact_bench import Bench
-from labseq_spcm.first_contact_verdict import judge
+from labseq_spcm.first_contact_verdict import STREAM, judge, streamed
 from labseq_spcm.library import SIMULATED, Library
 from labseq_spcm.settings import SpcmSettings
 
@@ -37,6 +37,7 @@ class SpcmFirstContact(FirstContact):
         self.is_simulated = settings.card.startswith(SIMULATED)
         full_scale = format_quantity(context.motion.rf.full_scale_v, "voltage")
         self.steps = tuple(_steps(self._bench, full_scale))
+        self.units = card.UNITS | transfer.UNITS
 
     def open(self) -> Mapping[str, Any]:
         """Open the card, stop it and open its relays."""
@@ -61,11 +62,17 @@ class SpcmFirstContact(FirstContact):
         return judge(measured, self._settings)
 
 
+def _with_settings(run: Callable[[Bench], Mapping[str, Any]], bench: Bench) -> Mapping[str, Any]:
+    """The result of a step with the settings of a stream, which a later first contact may not share."""
+    return {**run(bench), "settings": streamed(bench.settings)}
+
+
 def _steps(bench: Bench, full_scale: str) -> Iterator[ContactStep]:
     def step(
         name: str, does: str, limit_s: float, run: Callable[[Bench], Mapping[str, Any]], **more: Any
     ) -> ContactStep:
-        return ContactStep(name, does, limit_s, partial(run, bench), **more)
+        take = partial(_with_settings, run) if name in dict(STREAM) else run
+        return ContactStep(name, does, limit_s, partial(take, bench), **more)
 
     relays = "outputs at 0 V, their relays close for a moment"
     at_80_mv = "outputs on at 80 mV into 50 Ohm"

@@ -61,6 +61,12 @@ DDS_REAL: Final = {
 RATES_HZ: Final = (500e6, 600e6, 620e6, 624e6, 625e6, 640e6, 1000e6, 1250e6)
 """Rates that are tried with an external reference; 624 and 625 MHz are those of the profiles."""
 
+UNITS: Final = {
+    **dict.fromkeys(("card_type", "features", "extended_features", "modes"), ("bits",)),
+    "rates": ("hz", "hz", "s"),
+}
+"""Units that the names of the results leave out."""
+
 N_READS: Final = 5000
 """Reads of the status in each of two threads."""
 

@@ -16,6 +16,16 @@ from labseq.plugin.native import n_cores
 from labseq_spcm.first_contact_bench import Bench, Transfer
 from labseq_spcm.limits import FRAME_BYTES
 
+UNITS: Final = {
+    **dict.fromkeys(("user", "continuous"), ("bytes", "bytes_per_s")),
+    **dict.fromkeys(("status_playing", "status_dry"), ("bits",)),
+    **dict.fromkeys(
+        ("after_def_transfer", "after_hand_over", "after_startdma", "after_fetching"), ("bytes",)
+    ),
+    **dict.fromkeys(("notify_size", "card_buffer"), ("bytes",)),
+    "sample_rate": ("hz",),
+}
+"""Units that the names of the results leave out."""
 PAGE: Final = 4096
 NOTIFY_BYTES: Final = (PAGE << 2, PAGE << 4, PAGE << 7, PAGE << 9, PAGE << 10)
 """The notify sizes of the manual's table: 16 KiB to 4 MiB."""

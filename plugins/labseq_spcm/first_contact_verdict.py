@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final, TypeAlias
+
+from pydantic import ValidationError
 
 from labseq.plugin import format_quantity
 from labseq_spcm.limits import FRAME_BYTES, RATE_STEP_HZ
@@ -30,7 +32,10 @@ def _write_speed(result: Result, settings: SpcmSettings) -> str:
     speeds = {int(size): float(speed) for size, speed in result["user"]}
     speed = speeds.get(settings.notify_size, 0.0)
     enough = [size for size, speed in speeds.items() if speed >= needed and size <= LARGEST_NOTIFY_BYTES]
-    hint = f"notify_size {min(enough)} is enough" if enough else "no notify size is enough"
+    hint = "no notify size is enough"
+    if enough:
+        size = min(enough)
+        hint = f"notify_size {size} with card_buffer {max(2 * size, settings.card_buffer)} is enough"
     text = f"blocks of {settings.notify_size >> 10} KiB are written at {speed / 1e9:.3g} GB/s"
     return f"{text}, and the sample rate needs {needed / 1e9:.3g} ({hint})" if speed < needed else ""
 
@@ -162,15 +167,40 @@ def judge(measured: Mapping[str, Result], settings: SpcmSettings) -> dict[str, A
         "stream", "reason", and the "settings" for which this holds.
     """
     results = {step: result for step, result in measured.items() if not {"failed", "skipped"} & result.keys()}
-    against = [text for step, claim in STREAM if step in results and (text := claim(results[step], settings))]
-    missing = sorted({step for step, _ in STREAM} - results.keys())
-    against += [f"not measured: {', '.join(missing)}"] if missing else []
+    present = streamed(settings)
+    valid = {step: result for step, result in results.items() if result.get("settings") == present}
+    against = [text for step, claim in STREAM if step in valid and (text := claim(valid[step], settings))]
+    against += _refused(settings)
+    missing = dict.fromkeys(step for step, _ in STREAM if step not in valid)
+    against += [_missing(list(missing), [step for step in missing if step in results])] if missing else []
     others = list(_others(measured, results, settings))
     return {
         "stream": not against,
         "reason": "; ".join(against + others) or "the card does what the driver assumes",
-        "settings": settings.model_dump(include={"sample_rate", "notify_size", "card_buffer"}),
+        "settings": present,
     }
+
+
+def streamed(settings: SpcmSettings) -> dict[str, Any]:
+    """The settings for which a certificate is valid; steps record those with which they measured."""
+    return settings.model_dump(include={"sample_rate", "notify_size", "card_buffer"})
+
+
+def _refused(settings: SpcmSettings) -> list[str]:
+    """Why the driver refuses the mode ``stream`` with settings that another mode takes."""
+    try:
+        SpcmSettings.model_validate(settings.model_dump() | {"mode": "stream", "trigger": "software"})
+    except ValidationError as error:
+        return [detail["msg"].removeprefix("Value error, ") for detail in error.errors()]
+    return []
+
+
+def _missing(steps: Sequence[str], outdated: Sequence[str]) -> str:
+    """The steps that a certificate needs; some were measured with other settings."""
+    named = [f"{step} with an oscilloscope" if step == "overwrite" else step for step in steps]
+    text = f"the certificate needs the step{'s' if steps[1:] else ''} {', '.join(named)}"
+    was = f" ({', '.join(outdated)} measured with another sample_rate, notify_size or card_buffer)"
+    return text + was if outdated else text
 
 
 def _others(

@@ -11,8 +11,10 @@ from typing import Any
 
 import pytest
 
+from labseq.cli.first_contact import page_text
 from labseq.drivers import first_contact as file
 from labseq.drivers.first_contact import read_contact, write_contact
+from labseq.safety.first_contact import Contact
 
 PROFILE = """labseq: 1
 name: bench
@@ -131,7 +133,7 @@ def test_a_step_that_fails_or_hangs_is_named_and_the_device_ends_safe(call: Any)
     assert content["verdict"] == {"reason": "fine, fails, hangs"}
     assert out.count("FAILED") == 2
     page = JSON.with_suffix(".md").read_text("utf-8")
-    assert "| took_s | 1.5 |" in page
+    assert "| took | 1.5 s |" in page
     assert "jammed" in page
 
 
@@ -139,11 +141,59 @@ def steps(*names: str) -> list[str]:
     return [part for name in names for part in ("--step", name)]
 
 
-def test_ctrl_c_in_a_step_makes_the_device_safe_and_writes_nothing(call: Any) -> None:
-    code, _, err = call("first-contact", "./p.yaml", "box", "--yes", "--step", "stops", "--step", "fails")
+def test_ctrl_c_in_a_step_makes_the_device_safe_and_keeps_the_steps_before_it(call: Any) -> None:
+    code, out, err = call("first-contact", "./p.yaml", "box", "--yes", *steps("fine", "stops", "seen"))
     assert code == 128 + signal.SIGINT
     assert "Traceback" not in err
-    assert not JSON.exists()
+    assert read_contact(JSON)["measured"] == {"fine": {"took_s": 1.5}}
+    assert "| took | 1.5 s |" in JSON.with_suffix(".md").read_text("utf-8")
+    assert f"file: {JSON}" in out
+
+
+def test_a_data_folder_that_cannot_be_written_is_named_before_the_device_is_opened(call: Any) -> None:
+    Path("full").touch()
+    code, out, err = call("first-contact", "./p.yaml", "box", "--yes", "--output", "full")
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert "--output" in err
+
+
+def test_the_page_has_the_names_and_units_of_a_reader() -> None:
+    result = {
+        "reset_s": 2.2e-3,
+        "rate_hz": 623.75e6,
+        "lowest_mv": 80,
+        "memory_bytes": 1 << 32,
+        "front_c": 50,
+        "copy_s_per_byte": 1.25e-10,
+        "status": 0x706,
+        "naming_64_kib_s": None,
+        "speeds": [[65536, 2.79666e9], [4097, 0.46e9]],
+        "ready": True,
+        "none": [],
+    }
+    content = {
+        "card": {"model": "B1", "serial": "17", "driver": "1.0", "firmware": "2", "simulated": False},
+        "computer": {"node": "pc"},
+        "labseq": "1",
+        "ended_utc": "2026-01-01T00:00:00+00:00",
+        "measured": {"step": result},
+        "verdict": {"reason": "fine"},
+    }
+    units = {"status": ("bits",), "speeds": ("bytes", "bytes_per_s")}
+    page = page_text(Contact("box", JSON, content, units, []))
+    assert page.partition("## step")[2].split("\n")[4:15] == [
+        "| reset | 2.2 ms |",
+        "| rate | 623.75 MHz |",
+        "| lowest | 80 mV |",
+        "| memory | 4 GiB |",
+        "| front | 50 degrees Celsius |",
+        "| copy | 0.125 ns per byte |",
+        "| status | 0x706 |",
+        "| naming 64 KiB | not known |",
+        "| speeds | 64 KiB, 2.8 GB/s; 4097 bytes, 0.46 GB/s |",
+        "| ready | yes |",
+        "| none | none |",
+    ]
 
 
 class TestQuestions:
@@ -178,6 +228,14 @@ class TestEarlierResults:
         assert call("first-contact", "./p.yaml", "box", *arguments)[0] == 0
         assert read_contact(JSON)["measured"] == {"fine": {"took_s": 1.5}, "seen": {"delay_s": None}}
 
+    def test_of_steps_that_are_left_out_are_kept_and_their_faults_are_not_those_of_today(
+        self, call: Any, types: Any
+    ) -> None:
+        assert call("first-contact", "./p.yaml", "box", "--yes", *steps("fine", "fails"))[0] == 3
+        types("y", "n", "n", "n", "n")
+        assert call("first-contact", "./p.yaml", "box")[0] == 0
+        assert list(read_contact(JSON)["measured"]) == ["fine", "fails"]
+
     @pytest.mark.parametrize(
         ("change", "named"),
         [
@@ -187,7 +245,9 @@ class TestEarlierResults:
         ],
         ids=["edited", "of another computer", "of older firmware"],
     )
-    def test_that_do_not_belong_to_the_device_are_refused(self, call: Any, change: Any, named: str) -> None:
+    def test_that_do_not_belong_to_the_device_are_refused(
+        self, call: Any, types: Any, change: Any, named: str
+    ) -> None:
         call("first-contact", "./p.yaml", "box", "--yes", "--step", "fine")
         content = json.loads(JSON.read_text("utf-8"))
         change(content)
@@ -197,6 +257,9 @@ class TestEarlierResults:
         assert named in err
         assert "take all steps again with 'labseq first-contact'" in err
         assert json.loads(JSON.read_text("utf-8")) == content
+        types(*"nnnnn")
+        assert call("first-contact", "./p.yaml", "box")[0] == 0, "all steps again begin a new file"
+        assert read_contact(JSON)["measured"] == {}
 
 
 def sealed(content: dict[str, Any], part: str, **changes: str) -> None:
@@ -211,6 +274,12 @@ def test_a_device_whose_driver_has_no_steps_is_identified_and_the_verdict_says_s
     assert (content["card"]["model"], content["card"]["serial"]) == ("PM100", "P1/7")
     assert "only identity, settings and limits were read" in content["verdict"]["reason"]
     assert content["verdict"]["reason"] in out
+
+
+def test_a_simulated_camera_gets_the_simulation_that_the_awg_must_not_see(call: Any) -> None:
+    code, out, err = call("first-contact", "lab", "camera", "--dry-run")
+    assert (code, err) == (0, "")
+    assert "camera: DU-897" in out
 
 
 @pytest.mark.parametrize(
@@ -235,7 +304,10 @@ def test_the_awg_of_the_bench_gets_a_file_that_never_replaces_a_real_cards(call:
     content = read_contact(Path("elsewhere/first-contact/12345-simulated.json"))
     assert content["card"]["simulated"]
     assert not content["verdict"]["stream"]
-    assert "not measured: lag, overwrite, starve, sustained, write_speed" in content["verdict"]["reason"]
+    assert (
+        "the certificate needs the steps write_speed, lag, sustained, starve, overwrite"
+        in content["verdict"]["reason"]
+    )
 
 
 def test_without_the_vendors_library_the_awg_is_refused_with_the_remedy(call: Any) -> None:

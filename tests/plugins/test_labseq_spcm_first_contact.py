@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from labseq_spcm.first_contact import SpcmFirstContact
+from labseq_spcm.first_contact_verdict import judge
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 from labseq_spcm_sim import (
@@ -87,7 +88,7 @@ def with_faults(faults: Faults = Faults(), model: CardModel = M4I6631) -> Callab
 
 
 ALONE = ("identity", "times", "positions", "write_speed", "lag", "sustained", "starve", "threads")
-UNSEEN = "not measured: overwrite"
+UNSEEN = "the certificate needs the step overwrite with an oscilloscope"
 
 
 @pytest.mark.parametrize(
@@ -173,11 +174,23 @@ class TestScope:
             verdict = lab.contact.judge({**measured, "overwrite": result | readings})
         assert len(bursts) == (0 if copies else 20)
         assert verdict["stream"] is not copies
+        faster = SpcmSettings(sample_rate=625e6, card_buffer=1 << 17)
+        later = judge({**measured, "overwrite": result | readings}, faster)
+        assert "overwrite measured with another sample_rate" in later["reason"]
+        assert not later["stream"], "a certificate is not carried over to other settings"
         if copies:
             assert "0 of 20 bursts" in verdict["reason"]
         else:
             assert {span.amplitude_v for span in bursts} == {0.08}
             assert min(lengths_s) == pytest.approx(BLOCK_S, rel=0.01)
+
+    def test_settings_that_a_stream_refuses_get_no_certificate(self) -> None:
+        settings = SpcmSettings(card="simulated", notify_size=1 << 19)
+        reason = judge({}, settings)["reason"]
+        assert "card_buffer is 131072; expected at least twice notify_size, 1048576" in reason
+        with met(with_faults(Faults(write_speeds=MANUAL_SPEEDS)), sample_rate=320e6) as lab:
+            reason = lab.contact.judge(lab.take("write_speed"))["reason"]
+        assert "(notify_size 524288 with card_buffer 1048576 is enough)" in reason
 
     def test_the_trigger_step_plays_at_each_edge_and_its_delay_is_compared(self) -> None:
         with met(keep_history=True) as lab:
@@ -342,4 +355,4 @@ def test_the_command_that_is_killed_while_an_output_is_on_leaves_the_card_off(
     until(lambda: not outputs_on())
     assert instrument[0]("state") == (False, (False, False))
     instrument[0].close()
-    assert not (tmp_path / "data").exists(), "nothing was measured"
+    assert not list((tmp_path / "data").rglob("*.json")), "nothing was measured"
