@@ -174,6 +174,8 @@ class TestScope:
             verdict = lab.contact.judge({**measured, "overwrite": result | readings})
         assert len(bursts) == (0 if copies else 20)
         assert verdict["stream"] is not copies
+        unread = {"bursts": readings["bursts"], "shortest_s": None}
+        assert not lab.contact.judge({**measured, "overwrite": result | unread})["stream"], "perhaps cut"
         faster = SpcmSettings(sample_rate=625e6, card_buffer=1 << 17)
         later = judge({**measured, "overwrite": result | readings}, faster)
         assert "overwrite measured with another sample_rate" in later["reason"]
