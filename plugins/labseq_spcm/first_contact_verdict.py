@@ -178,7 +178,9 @@ def judge(measured: Mapping[str, Result], settings: SpcmSettings) -> dict[str, A
     others = list(_others(measured, results, settings))
     return {
         "stream": not against,
-        "reason": "; ".join(against + others) or "the card does what the driver assumes",
+        # the page has a line for each of them
+        "reason": "; ".join(part.replace("; ", ": ") for part in against + others)
+        or "the card does what the driver assumes",
         "settings": present,
     }
 
