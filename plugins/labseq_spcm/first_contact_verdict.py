@@ -80,10 +80,12 @@ def _ready(result: Result, _settings: SpcmSettings) -> str:
 def _bursts(result: Result, _settings: SpcmSettings) -> str:
     seen, shortest_s, whole_s = result.get("bursts"), result.get("shortest_s"), result["burst_s"]
     if seen is None:
-        return "nobody has seen whether written-over samples reach the output"
+        return "the number of bursts was not read from the oscilloscope"
     if seen < result["in_time"] or not result["in_time"]:
         return f"{seen:g} of {result['in_time']} bursts that were written over silence reached the output"
-    is_cut = seen == result["in_time"] and shortest_s is not None and shortest_s < 0.9 * whole_s
+    if shortest_s is None:
+        return "the length of the shortest burst was not read from the oscilloscope"
+    is_cut = seen == result["in_time"] and shortest_s < 0.9 * whole_s
     return "bursts that were written over silence lost their beginning" if is_cut else ""
 
 
@@ -176,7 +178,9 @@ def judge(measured: Mapping[str, Result], settings: SpcmSettings) -> dict[str, A
     others = list(_others(measured, results, settings))
     return {
         "stream": not against,
-        "reason": "; ".join(against + others) or "the card does what the driver assumes",
+        # the page has a line for each of them
+        "reason": "; ".join(part.replace("; ", ": ") for part in against + others)
+        or "the card does what the driver assumes",
         "settings": present,
     }
 

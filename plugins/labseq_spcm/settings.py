@@ -178,10 +178,9 @@ class SpcmSettings(Settings):
         if row == column:
             raise ValueError(f"row_channel and column_channel are both {row}; expected two outputs")
         if self.model and max(row, column) >= self.limits.n_outputs:
-            n_outputs = self.limits.n_outputs
-            raise ValueError(
-                f"the {self.model} has {n_outputs} outputs; expected row_channel and column_channel of them"
-            )
+            numbers = " and ".join(map(str, range(self.limits.n_outputs)))
+            channels = f"row_channel is {row} and column_channel {column}"
+            raise ValueError(f"{channels}; expected two of the {self.model}'s: {numbers}")
         return self
 
     @model_validator(mode="after")

@@ -174,6 +174,8 @@ class TestScope:
             verdict = lab.contact.judge({**measured, "overwrite": result | readings})
         assert len(bursts) == (0 if copies else 20)
         assert verdict["stream"] is not copies
+        unread = {"bursts": readings["bursts"], "shortest_s": None}
+        assert not lab.contact.judge({**measured, "overwrite": result | unread})["stream"], "perhaps cut"
         faster = SpcmSettings(sample_rate=625e6, card_buffer=1 << 17)
         later = judge({**measured, "overwrite": result | readings}, faster)
         assert "overwrite measured with another sample_rate" in later["reason"]
@@ -186,8 +188,9 @@ class TestScope:
 
     def test_settings_that_a_stream_refuses_get_no_certificate(self) -> None:
         settings = SpcmSettings(card="simulated", notify_size=1 << 19)
-        reason = judge({}, settings)["reason"]
-        assert "card_buffer is 131072; expected at least twice notify_size, 1048576" in reason
+        reason = judge({"dds": {"failed": "refused; try again"}}, settings)["reason"]
+        assert reason.endswith("; the step dds failed: refused: try again"), "one line of the page for each"
+        assert "card_buffer is 131072: expected at least twice notify_size, 1048576" in reason
         with met(with_faults(Faults(write_speeds=MANUAL_SPEEDS)), sample_rate=320e6) as lab:
             reason = lab.contact.judge(lab.take("write_speed"))["reason"]
         assert "(notify_size 524288 with card_buffer 1048576 is enough)" in reason

@@ -53,7 +53,7 @@ class TestFourOutputs:
         [
             ({"row_channel": 2}, "row_channel is 2; expected column_channel"),
             ({"row_channel": 1, "column_channel": 1}, "are both 1"),
-            ({"model": "M4i.6631-x8", "column_channel": 3}, "the M4i.6631-x8 has 2 outputs"),
+            ({"model": "M4i.6631-x8", "column_channel": 3}, "expected two of the M4i.6631-x8's: 0 and 1"),
             ({"model": "M4i.6666-x8"}, "expected one of M4i.6620-x8, "),
             ({"model": "M4x.6631-x4", "mode": "fifo", "sample_rate": 625e6}, "at most 375 MHz"),
             (
