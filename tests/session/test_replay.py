@@ -208,7 +208,8 @@ def test_a_shot_that_cannot_be_read_is_left_out_and_reported(taken, tmp_path):
 def test_a_shot_with_two_frames_of_an_image_is_left_out_and_reported(taken, tmp_path):
     folder = shutil.copytree(taken.path, tmp_path / taken.path.name)
     with h5py.File(open_run(folder).shots[1].file, "r+") as file:
-        file["entry/camera/camera/image"][:] = 0
+        numbers: Any = file["entry/camera/camera/image"]
+        numbers[:] = 0
     found = replay(open_run(folder), ReplayRequest())
     assert list(found.unreadable) == [1]
     assert "two frames of image 0" in found.unreadable[1]
