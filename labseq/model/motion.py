@@ -136,7 +136,7 @@ class LossSpec:
             "lane of the paper's lattice; a factor e less for each further 0.12 um, and less in shallower "
             "tweezers, see `path_depth`; the tweezer's own atom is then lost too"
         ),
-    ] = 0.0044
+    ] = 0.0022
     spread: Annotated[
         float,
         Field(
