@@ -38,7 +38,7 @@ def meet(
         The exit code: 0, or 3 if a step failed.
 
     Raises:
-        ConfigError: The profile or an option has an error, or there is nobody to ask.
+        ConfigError: The profile or an option has an error, or no terminal can answer.
         DeviceError: A device cannot be opened, or is not safe.
     """
     for name in instruments:
@@ -123,7 +123,7 @@ def _answer(question: str, stop: StopFlag) -> str:
     """What the user types. A request to stop ends the wait, which ``input`` alone would not obey.
 
     Raises:
-        ConfigError: Nobody can answer, because stdin is closed.
+        ConfigError: The user cannot answer, because stdin is closed.
         StopRequested: Ctrl-C.
     """
     sys.stdout.write(question)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import platform
 import sys
 import uuid
@@ -48,15 +49,9 @@ def _machine_id() -> str:
 
 
 def digest_of(content: Mapping[str, Any]) -> str:
-    """The digest of everything else in the content; it reveals an edited file, and protects from nothing."""
+    """The digest of all other keys of a file; it reveals an edited file, and protects from nothing."""
     rest = {key: value for key, value in content.items() if key != "digest"}
-    return hashlib.sha256(dumps(_sorted(rest)).encode()).hexdigest()
-
-
-def _sorted(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _sorted(value[key]) for key in sorted(value, key=str)}
-    return [_sorted(item) for item in value] if isinstance(value, list | tuple) else value
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def write_contact(path: Path, content: Mapping[str, Any]) -> None:

@@ -5,10 +5,7 @@ from __future__ import annotations
 from labseq.drivers.first_contact import (
     check_belongs,
     contact_path,
-    digest_of,
     read_contact,
-    this_computer,
-    write_contact,
 )
 from labseq.files import data_root
 from labseq.roles.first_contact import ContactStep, FirstContact, OffersFirstContact, Reading
@@ -21,8 +18,5 @@ __all__ = [
     "check_belongs",
     "contact_path",
     "data_root",
-    "digest_of",
     "read_contact",
-    "this_computer",
-    "write_contact",
 ]

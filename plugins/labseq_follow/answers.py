@@ -68,11 +68,11 @@ class Times:
 
 
 def facts_of(about: Mapping[str, Any], times: Times) -> dict[str, Any]:
-    """What is told of a shot, ready for JSON; times are in seconds after `go`.
+    """The facts of a shot that an answer gives, ready for JSON; times are in seconds after `go`.
 
     Args:
         about: As ``labseq.plugin.LeaderLink.report`` receives it.
-        times: Those of the `go`. Only images, steps and stages that began after it was taken are told.
+        times: Those of the `go`. Only images, steps and stages that began after it was taken are given.
     """
     facts = {key: about[key] for key in ("shot", "success", "filling") if key in about}
     facts |= {"taken_s": _time(times.taken_s - times.go_s), "done_s": _time(times.done_s - times.go_s)}

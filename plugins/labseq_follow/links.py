@@ -71,7 +71,7 @@ class Link:
         """Send a line; from any thread."""
 
     def finish(self) -> bytes:
-        """Receive nothing more; returns the bytes of which ``poll`` has not told yet."""
+        """Receive nothing more; returns the bytes that ``poll`` has not returned yet."""
         return b""
 
     def close(self) -> None:

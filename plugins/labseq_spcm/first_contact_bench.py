@@ -202,14 +202,14 @@ class Bench:
 
     # The card
 
-    def told(self, register: int) -> int | None:
+    def read_if_known(self, register: int) -> int | None:
         """A register; None if this card, or its driver, does not know it."""
         try:
             return self.card.read(register)
         except DeviceError:
             return None
 
-    def told_real(self, register: int) -> float | None:
+    def read_real_if_known(self, register: int) -> float | None:
         """A register of a real number; None if this card, or its driver, does not know it."""
         value, handle = ctypes.c_double(), ctypes.c_void_p(self.card.handle)
         if self.card.spcm.spcm_dwGetParam_d64(handle, register, ctypes.byref(value)):

@@ -74,7 +74,7 @@ N_READS: Final = 5000
 def identity(bench: Bench) -> dict[str, Any]:
     """Read what the card is and can do, and how warm it is."""
     spcm = bench.card.spcm
-    facts: dict[str, Any] = {key: bench.told(getattr(spcm, name)) for key, name in REGISTERS.items()}
+    facts: dict[str, Any] = {key: bench.read_if_known(getattr(spcm, name)) for key, name in REGISTERS.items()}
     facts["driver_modes"] = [
         key for key, name in MODES.items() if (facts["modes"] or 0) & getattr(spcm, name)
     ]
@@ -197,12 +197,12 @@ def _made_from_reference(bench: Bench, rate_hz: int) -> tuple[int, int, float]:
 def dds(bench: Bench) -> dict[str, Any]:
     """Read what the option DDS offers; nothing is played with it, because labseq does not use it."""
     card, spcm = bench.fresh(), bench.card.spcm
-    if not (bench.told(spcm.SPC_PCIEXTFEATURES) or 0) & spcm.SPCM_FEAT_EXTFW_DDS20:
+    if not (bench.read_if_known(spcm.SPC_PCIEXTFEATURES) or 0) & spcm.SPCM_FEAT_EXTFW_DDS20:
         return {"skipped": "the card has no licence of the option DDS, which labseq does not need"}
     card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_STD_DDS, "card mode")
     card.write_setup()
-    facts: dict[str, Any] = {key: bench.told(getattr(spcm, name)) for key, name in DDS.items()}
-    return facts | {key: bench.told_real(getattr(spcm, name)) for key, name in DDS_REAL.items()}
+    facts: dict[str, Any] = {key: bench.read_if_known(getattr(spcm, name)) for key, name in DDS.items()}
+    return facts | {key: bench.read_real_if_known(getattr(spcm, name)) for key, name in DDS_REAL.items()}
 
 
 SCRIPT: Final = Path(__file__).with_name("first_contact_child.py")
@@ -233,7 +233,7 @@ def second_process(bench: Bench, *, with_tone: bool = False) -> dict[str, Any]:
         child.wait(10.0)
     killed_s = bench.now()
     opened_s = bench.timed(bench.open_again)
-    runs_on, relays = bench.card.running, bench.told(bench.card.spcm.SPC_ENABLEOUT0)
+    runs_on, relays = bench.card.running, bench.read_if_known(bench.card.spcm.SPC_ENABLEOUT0)
     with bench.lent():
         bench.pause(max(0.0, ALONE_S - (bench.now() - killed_s)))
         off_s = bench.timed(lambda: _call(bench, emergency.script, "off", dict(emergency.arguments)))

@@ -251,7 +251,7 @@ def starve(bench: Bench) -> dict[str, Any]:
     bench.pause(10e-3)  # the second bit may come a little later
     status = card.status
     answer = _answer(transfer)
-    user_bytes = bench.told(spcm.SPC_DATA_AVAIL_USER_LEN)
+    user_bytes = bench.read_if_known(spcm.SPC_DATA_AVAIL_USER_LEN)
     again = Transfer(bench, transfer.frames, block)
     recovery_s = bench.timed(lambda: _begin_again(bench, again))
     again.settled()

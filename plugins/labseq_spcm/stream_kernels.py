@@ -140,7 +140,7 @@ def find_cuts(
 
 @helper_kernel("int64(int64[::1], int64, int64, int64)")
 def call_library(box: Words, function: int, register: int, value: int) -> int:
-    """Call one of the library's functions when nobody else does; returns its error code."""
+    """Call one of the library's functions while no other thread does; returns its error code."""
     if box[LOCK]:
         take(box[LOCK], carray(pointer(box[TIMER]), N_TIMER, np.int64))
     box[ERROR] = call_c(function, box[HANDLE], register, value)

@@ -64,18 +64,21 @@ def measured_card(path: Path) -> NewCard:
 
 
 def _model(name: str, identity: Mapping[str, Any]) -> CardModel:
-    """The card's own figures, where the card told them."""
-    told = {key: value for key, value in identity.items() if value is not None}
+    """The card's own figures, as far as the card reported them."""
+    known = {key: value for key, value in identity.items() if value is not None}
     low_hz, high_hz = M4I6631.sample_rate_hz
     low_mv, high_mv = M4I6631.amplitude_mv
     return replace(
         MODELS.get(name, M4I6631),
         name=name,
-        card_type=told.get("card_type", M4I6631.card_type),
-        memory_samples=told.get("memory_bytes", 2 * M4I6631.memory_samples) // 2,
-        sample_rate_hz=(told.get("lowest_rate_hz", low_hz), told.get("highest_rate_hz", high_hz)),
-        amplitude_mv=(told.get("lowest_amplitude_mv", low_mv), told.get("highest_amplitude_mv", high_mv)),
-        temperature_c=told.get("base_card_c", M4I6631.temperature_c),
+        card_type=known.get("card_type", M4I6631.card_type),
+        memory_samples=known.get("memory_bytes", 2 * M4I6631.memory_samples) // 2,
+        sample_rate_hz=(known.get("lowest_rate_hz", low_hz), known.get("highest_rate_hz", high_hz)),
+        amplitude_mv=(
+            known.get("lowest_amplitude_mv", low_mv),
+            known.get("highest_amplitude_mv", high_mv),
+        ),
+        temperature_c=known.get("base_card_c", M4I6631.temperature_c),
     )
 
 

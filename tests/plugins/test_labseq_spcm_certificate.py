@@ -13,8 +13,8 @@ from labseq_spcm import certificate
 from labseq_spcm.mobile_tweezers import SpcmMobileTweezers
 from labseq_spcm.settings import SpcmSettings
 
+from labseq.drivers.first_contact import contact_path, this_computer, write_contact
 from labseq.plugin import ConfigError, Context
-from labseq.plugin.first_contact import contact_path, this_computer, write_contact
 
 SERIAL = 12345
 CARD = {"serial": str(SERIAL), "model": "M4i.6631-x8", "driver": "7.9.22000", "firmware": "1"}
