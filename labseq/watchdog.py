@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import sys
 import threading
@@ -154,7 +155,7 @@ class Watchdog:
         self._wake.clear()
         try:
             self._process = subprocess.Popen(  # noqa: S603 - our file, no shell
-                [sys.executable, "-I", "-S", watchdog_process.__file__],
+                [sys.executable, "-I", "-S", watchdog_process.__file__, str(os.getpid())],
                 bufsize=0,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,

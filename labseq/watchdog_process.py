@@ -1,8 +1,8 @@
 """The watchdog: a small process that switches the outputs off when the run that uses them dies or hangs.
 
-It needs the standard library alone: it must start fast, stay small, and work when nothing else does. The
-run's side, :mod:`labseq.watchdog`, passes on how each device is switched off (``Emergency``), and sends a
-heartbeat. Messages are lines of JSON on standard input; an empty line is a heartbeat; the end of the input
+It needs the standard library alone, and psutil on Windows: it must start fast, stay small, and work when
+nothing else does. The run's side, :mod:`labseq.watchdog`, passes on how each device is switched off
+(``Emergency``), and sends a heartbeat. Messages are lines of JSON on standard input; an empty line is a heartbeat; the end of the input
 without ``end`` is the death of the run. It answers in the same way on standard output, so that the run
 notices when the watchdog dies or stands still, and starts another one.
 """
@@ -46,7 +46,7 @@ def main() -> None:
         if (number := getattr(signal, name, None)) is not None:
             signal.signal(number, signal.SIG_IGN)
     _take_precedence()
-    _Process().watch()
+    _Process(int(sys.argv[1])).watch()
     os._exit(0)  # its threads may still wait for a device or for the run
 
 
@@ -93,16 +93,22 @@ class _Device:
 
 
 class _Process:
-    """The watchdog's own process."""
+    """The watchdog's own process.
 
-    def __init__(self) -> None:
+    Args:
+        run_pid: Process id of the run. On Windows the run need not be the parent: the ``python.exe`` of a
+            virtual environment only starts another one.
+    """
+
+    def __init__(self, run_pid: int) -> None:
         self._lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._devices: dict[str, _Device] = {}
         self._log: Path | None = None
         self._run_name = "the run"
         self._may_end = False
-        self._parent = os.getppid()
-        self._hangs = Hanging(self._parent)
+        self._run_pid = run_pid
+        self._run_process: Any = None  # of psutil, on Windows
+        self._hangs = Hanging(run_pid)
         self._beat_s = time.monotonic()
 
     def watch(self) -> None:
@@ -139,7 +145,9 @@ class _Process:
 
     def _is_orphan(self) -> bool:
         """Whether the run is gone although another process still holds its end of the pipe."""
-        return os.name != "nt" and os.getppid() != self._parent
+        if os.name == "nt":  # where the id of the parent stays, and may be given to another process
+            return self._run_process is not None and not self._run_process.is_running()
+        return os.getppid() != self._run_pid
 
     def _obey(self, order: dict[str, Any]) -> bool:
         """Carry out a message; returns whether to go on."""
@@ -147,6 +155,10 @@ class _Process:
             self._run_name, self._log = order["run"], Path(order["log"]) if order["log"] else None
             self._may_end = order["may_end"]
             sys.path += [path for path in order["path"] if path not in sys.path]
+            if os.name == "nt":
+                import psutil
+
+                self._run_process = psutil.Process(self._run_pid)
             self._answer("")
         elif "device" in order:
             try:
@@ -180,7 +192,7 @@ class _Process:
             if self._is_orphan():
                 return
             with suppress(OSError):
-                os.kill(self._parent, getattr(signal, name, signal.SIGTERM))
+                os.kill(self._run_pid, getattr(signal, name, signal.SIGTERM))
             deadline = time.monotonic() + wait_s
             while time.monotonic() < deadline and not self._is_orphan():
                 time.sleep(0.002)
