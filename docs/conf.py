@@ -1,8 +1,14 @@
 """Sphinx configuration."""
 
 import re
+import sys
+from pathlib import Path
 
 import labseq
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from make_reference import complete
 
 project = "labseq"
 author = "the labseq developers"
@@ -19,8 +25,9 @@ html_css_files = ["labseq.css"]
 html_theme_options = {"description": release, "page_width": "1100px"}
 
 
-def add_contents(_app: object, page: str, source: list[str]) -> None:
-    """Make the links of an index page its table of contents."""
+def add_parts(_app: object, page: str, source: list[str]) -> None:
+    """Put the generated parts of the reference into a page; make the links of an index page its contents."""
+    source[0] = complete(source[0])
     if page.rpartition("/")[2] == "index":
         pages = dict.fromkeys(re.findall(r"\]\(([\w-]+(?:/index)?)\.md\)", source[0]))
         source[0] += "\n```{toctree}\n:hidden:\n\n" + "\n".join(pages) + "\n```\n"
@@ -28,4 +35,4 @@ def add_contents(_app: object, page: str, source: list[str]) -> None:
 
 def setup(app: object) -> None:
     """Connect what this file defines."""
-    app.connect("source-read", add_contents)  # pyright: ignore[reportAttributeAccessIssue]
+    app.connect("source-read", add_parts)  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,8 +1,6 @@
-"""Write the generated parts of the reference pages: between the comments ``reference: ...`` and ``end``.
+"""The generated parts of the pages, which ``conf.py`` puts where a page has the comment ``reference: ...``.
 
-    python docs/make_reference.py
-
-They are Markdown as the rest of the page; what they contain is in ``labseq.scaffold.reference``. The
+They are Markdown like the rest of the page; what they contain is in ``labseq.scaffold.reference``. The
 comment names the part and its arguments: ``settings profile grid``, ``plugins camera``, ``command run``.
 """
 
@@ -12,7 +10,6 @@ import ast
 import importlib
 import inspect
 import re
-import sys
 import textwrap
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -38,8 +35,8 @@ from labseq.testing import SUITES, fakes, strategies
 from labseq.testing.contracts import HardwareContract
 
 DOCS: Final = Path(__file__).parent
-PART: Final = re.compile(r"<!-- reference: (.+?) -->\n(.*?)<!-- end -->", re.DOTALL)
-"""A generated part of a page: its name and arguments, and its text."""
+PART: Final = re.compile(r"<!-- reference: (.+?) -->")
+"""The place of a generated part on a page: the part's name and arguments."""
 PROGRAM: Final[Any] = typer.main.get_command(app)
 
 _SCRIPTS: Final = (
@@ -74,9 +71,9 @@ _GIVEN: Final = {"self", "device", "shape", "seed", "kind", "duration_s"}
 """Arguments of what a plugin's test may override; methods with others serve the suite itself."""
 
 
-def current(page: str) -> str:
-    """The text of a page with its generated parts as they are now."""
-    return PART.sub(lambda part: f"<!-- reference: {part[1]} -->\n\n{text_of(part[1])}\n\n<!-- end -->", page)
+def complete(page: str) -> str:
+    """The text of a page with its generated parts."""
+    return PART.sub(lambda part: text_of(part[1]), page)
 
 
 def text_of(part: str) -> str:
@@ -290,21 +287,3 @@ PARTS: Final[Mapping[str, Callable[..., list[Block]]]] = {
     "words": reference.words,
 }
 """Name of a part -> makes it."""
-
-
-def pages() -> list[Path]:
-    """The pages with generated parts."""
-    return [path for path in sorted(DOCS.rglob("*.md")) if PART.search(path.read_text("utf-8"))]
-
-
-def main() -> None:
-    """Write all pages."""
-    for path in pages():
-        text = path.read_text("utf-8")
-        if (made := current(text)) != text:
-            path.write_text(made, "utf-8", newline="\n")
-            sys.stdout.write(f"written: {path.relative_to(DOCS.parent)}\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """The reference: every key, plugin, command, role, event and field of a file, as topics.
 
-A topic is a list of blocks: :func:`plain` writes them for the terminal, docs/make_reference.py for the pages.
+A topic is a list of blocks: :func:`plain` writes them for the terminal, docs/make_reference.py for the site.
 The names of topics are words: ``step image``, ``profile grid spacing``, ``command bench planners``.
 """
 

@@ -30,7 +30,6 @@ PAGES: Final = sorted(
 COMMENT: Final = re.compile(r"<!-- (file|output|run with|exit code|not run)\b(.*) -->")
 FENCE: Final = re.compile(r"^( *)(`{3,})([^`\n]*)\n(.*?)^ *\2`*[ ]*$", re.DOTALL | re.MULTILINE)
 """A block of code: its indentation, its fence, its language, its text."""
-_GENERATED: Final = re.compile(r"<!-- reference: .*?<!-- end -->", re.DOTALL)
 _NOT_RUN: Final = re.compile(r"(?: \((.+?)\))?: (.+)")
 
 
@@ -73,15 +72,10 @@ class Block:
         return tuple(found[1].split("; ")) if found and found[1] else ()
 
 
-def written(page: Path) -> str:
-    """The text of a page, with blank lines for its generated parts."""
-    return _GENERATED.sub(lambda part: "\n" * part[0].count("\n"), page.read_text("utf-8"))
-
-
 @cache
 def blocks_of(page: Path) -> list[Block]:
-    """The fenced blocks of a page in order, but for directives and what is generated."""
-    text, name = written(page), page.relative_to(ROOT).as_posix()
+    """The fenced blocks of a page in order, except directives."""
+    text, name = page.read_text("utf-8"), page.relative_to(ROOT).as_posix()
     lines = text.splitlines()
     found: list[Block] = []
     for fence in FENCE.finditer(text):
@@ -102,7 +96,7 @@ def blocks_of(page: Path) -> list[Block]:
 
 def inline_of(page: Path) -> list[Block]:
     """The commands of labseq that stand in the text of a page."""
-    text, name = written(page), page.relative_to(ROOT).as_posix()
+    text, name = page.read_text("utf-8"), page.relative_to(ROOT).as_posix()
     prose = re.sub(r"^(```+).*?^\1$", "", text, flags=re.DOTALL | re.MULTILINE)
     codes = [code.replace("\n", " ") for code in re.findall(r"`(labseq[\s][^`]+)`", prose)]
     return [Block(name, i, "inline", code, {}) for i, code in enumerate(codes)]

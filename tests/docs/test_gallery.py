@@ -54,7 +54,7 @@ def patterns() -> list[str]:
 def test_every_pattern_has_a_picture_and_a_section(name: str) -> None:
     assert name in {example.pattern for example in EXAMPLES}
     assert f"\n## {name}\n" in PAGE
-    assert f"| [{name}](#{name.replace('_', '-')}) |" in PAGE
+    assert f"| [{name}](#{name}) |" in PAGE
     assert re.search(rf"^<!-- reference: .*\bpattern {name}\b.* -->$", PAGE, re.MULTILINE)
 
 
