@@ -2,9 +2,9 @@
 
 It needs the standard library alone, and psutil on Windows: it must start fast, stay small, and work when
 nothing else does. The run's side, :mod:`labseq.watchdog`, passes on how each device is switched off
-(``Emergency``), and sends a heartbeat. Messages are lines of JSON on standard input; an empty line is a heartbeat; the end of the input
-without ``end`` is the death of the run. It answers in the same way on standard output, so that the run
-notices when the watchdog dies or stands still, and starts another one.
+(``Emergency``), and sends a heartbeat. Messages are lines of JSON on standard input; an empty line is a
+heartbeat; the end of the input without ``end`` is the death of the run. It answers in the same way on
+standard output, so that the run notices when the watchdog dies or hangs, and starts another one.
 """
 
 from __future__ import annotations
