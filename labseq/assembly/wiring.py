@@ -14,8 +14,6 @@ from labseq.sequencer.lines import blinding_lines, trigger_line
 from labseq.units import format_quantity
 
 ROUNDING: Final = 1e-9
-BULB_ERROR: Final = 1e-3
-"""Largest relative error of an exposure that the edges of a line make."""
 
 
 def wrong_wiring(document: Document, lab: Lab) -> Iterator[Problem]:
@@ -86,7 +84,8 @@ def _between_edges(
 ) -> Iterator[tuple[Loc, Problem]]:
     for loc, bar in bars if resolution_s else ():
         made_s = round(bar.exposure_s / resolution_s) * resolution_s
-        if abs(made_s - bar.exposure_s) > BULB_ERROR * bar.exposure_s:
+        # largest relative error of an exposure that the edges of a line make
+        if abs(made_s - bar.exposure_s) > 1e-3 * bar.exposure_s:
             came, step = (format_quantity(s, "time") for s in (bar.exposure_s, resolution_s))
             what = f"the exposure is {came}, and the edges of the line make it (`line_trigger: bulb`)"
             yield (*loc, "exposure"), Problem(what, expected=f"a multiple of {step}")

@@ -296,8 +296,6 @@ class Tally:
 
 SIDE_WIDTH: Final = 48
 _GAP: Final = 3
-_SCAN_HEIGHT: Final = 8
-"""Maximum number of lines of the plot of a scan."""
 
 
 class Picture:
@@ -339,7 +337,8 @@ class Picture:
         parts: list[RenderableType] = [_results(tally), Text(), _stages(tally), *_caption(tally)]
         if tally.scan is not None:
             free = room - len(lines_of(Group(*parts))) - 1
-            plot = draw_scan(tally.scan, tally.measured, SIDE_WIDTH, min(free, _SCAN_HEIGHT), glyphs)
+            # maximum number of lines of the plot of a scan
+            plot = draw_scan(tally.scan, tally.measured, SIDE_WIDTH, min(free, 8), glyphs)
             parts += [Text(), *plot] if plot else []
         array = _array(tally, width - _GAP - SIDE_WIDTH, room, glyphs)
         if not array:
@@ -461,14 +460,8 @@ def _caption(tally: Tally) -> list[Text]:
 
 
 MIN_WIDTH: Final = 16
-MIN_HEIGHT: Final = 4
-"""Minimum number of lines of a plot, including its title and the line below it."""
-_BAR: Final = 5
-"""Maximum width of the bar of a point."""
 _LABEL: Final = 7
 """Width of the numbers on the left."""
-_LEAST_RANGE: Final = 0.01
-"""Minimum range of the plot, as a fraction of the largest value."""
 
 
 def draw_scan(
@@ -476,7 +469,8 @@ def draw_scan(
 ) -> list[Text]:
     """Draw the first quantity that has values, at each point of a scan."""
     points = scan.points()
-    if not points or width < MIN_WIDTH or height < MIN_HEIGHT:
+    # minimum number of lines of a plot, including its title and the line below it
+    if not points or width < MIN_WIDTH or height < 4:
         return []
     shown = _merged([lines for _, lines in points], width - _LABEL)
     for series in measured:
@@ -488,8 +482,10 @@ def draw_scan(
     quantity, values = series.quantity, [None if math.isnan(value) else value for value in means]
     unit, factor = shown_unit(quantity, there)
     high = max(there)
-    low = 0.0 if quantity.is_rate else min(high - _LEAST_RANGE * (abs(high) or 1.0), *there)
-    bar = max(1, min(_BAR, (width - _LABEL) // len(shown)))
+    # minimum range of the plot, as a fraction of the largest value
+    low = 0.0 if quantity.is_rate else min(high - 0.01 * (abs(high) or 1.0), *there)
+    # maximum width of the bar of a point
+    bar = max(1, min(5, (width - _LABEL) // len(shown)))
     rows = _bars(values, low, high or 1.0, height - 2, bar, glyphs)
     ends = [f"{end / factor:.3g} {unit}".strip().rjust(_LABEL - 1) + " " for end in (high or 1.0, low)]
     margins = [ends[0], *[" " * _LABEL] * (len(rows) - 2), ends[1]]

@@ -21,8 +21,6 @@ from labseq.recording.run_file import SCANNER
 
 PAUSE: Final = 100.0
 """Minimum time between two fits, as a multiple of what the last one took: they delay shots by 1 % at most."""
-MAX_PAUSE_S: Final = 20.0
-"""Maximum time between two fits, in seconds: the first takes longer, as it loads what the others use."""
 
 
 class LiveFits:
@@ -66,7 +64,8 @@ class LiveFits:
         except RecordingError:  # run.json cannot be read: the summary tells why
             self._series = []
         ended_s = time.monotonic()
-        self._next_s = ended_s + min(PAUSE * (ended_s - began_s), MAX_PAUSE_S)
+        # maximum time between two fits, in seconds: the first takes longer, as it loads what the others use
+        self._next_s = ended_s + min(PAUSE * (ended_s - began_s), 20.0)
 
     def _fit(self, lines: Mapping[int, Sequence[int]]) -> None:
         run = self._run = self._run or open_run(self._run_dir)

@@ -12,7 +12,7 @@ from contextlib import closing, suppress
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from labseq import __version__
 from labseq.data.entry import RunEntry
@@ -95,10 +95,6 @@ def _condition(text: str) -> Callable[[RunEntry], bool]:
     return meets
 
 
-SETTLED_S: Final = 2.0
-"""A run whose files changed within this time is not kept: another change could leave the same time."""
-
-
 class Kept(NamedTuple):
     """What is kept of a run: the state of its files, what a search looks through, and its entry as JSON."""
 
@@ -158,7 +154,8 @@ def _stamp(folder: str) -> str:
         with suppress(OSError):
             states += sorted(_changed(entry.path) for entry in os.scandir(results))
     newest = max(states)
-    is_settled = newest and time.time() - newest[0] / 1e9 >= SETTLED_S
+    # a run whose files changed within this time is not kept: another change could leave the same time
+    is_settled = newest and time.time() - newest[0] / 1e9 >= 2.0
     return f"{__version__} {states}" if is_settled else ""
 
 

@@ -23,8 +23,6 @@ FURTHEST: Final = 3.0
 end, there would be infinitely many atoms that are barely bound."""
 ETA_STEP: Final = 0.05
 """Step of the logarithm of a trap's depth in units of kT; recapture is linear within 0.001 between two."""
-MAX_PERIODS: Final = 300.0
-"""Largest number of periods within the points for which an oscillation is searched."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,7 +199,8 @@ def _guess_damped_cosine(x: Floats, y: Floats) -> dict[str, float]:
     is the periodogram of Lomb and Scargle with a free mean (Zechmeister, Kuerster, A&A 496, 577, 2009).
     """
     span = float(np.ptp(x))
-    highest = min(max(0.5 * span / _spacing(x), 1.0), MAX_PERIODS)
+    # largest number of periods within the points for which an oscillation is searched
+    highest = min(max(0.5 * span / _spacing(x), 1.0), 300.0)
     # each number of periods within the points is a minimum of its own, so the steps are a tenth of one
     frequencies = np.arange(0.3, highest + 0.1, 0.1) / span
     decays = float(np.abs(x).max()) * np.array([10.0, 1.0, 0.3])

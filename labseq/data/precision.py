@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from labseq.data.fits import Fit
 from labseq.data.numbers import Parameter
 from labseq.messages import clean
 from labseq.units import dimension_of, parse_any, split_quantity
-
-MAX_CHI_SQUARE: Final = 4.0
-"""Reduced chi-square above which points do not follow a model: errors are then too small by a factor of 2."""
 
 
 class ErrorLimit(NamedTuple):
@@ -61,4 +58,5 @@ def read_limit(written: float | str, unit: str) -> ErrorLimit:
 
 def follows(fit: Fit) -> bool:
     """Whether the points have errors and follow the model."""
-    return fit.reduced_chi_square <= MAX_CHI_SQUARE
+    # reduced chi-square above which points do not follow a model: errors are then too small by a factor of 2
+    return fit.reduced_chi_square <= 4.0

@@ -168,8 +168,6 @@ REACH: Final = 2.7
 KNOT_PX: Final = 64
 """Distance of the knots of stray light, in pixels; it changes linearly between them."""
 
-MISSHAPEN: Final = 0.01
-"""How well the shape of spots is known, relative to their peak; bright ones are not fitted by their wings."""
 
 DIM: Final = 0.25
 """Spots with less than this fraction of the usual light do not affect the width, and move little."""
@@ -226,7 +224,9 @@ def fit_spots(flat: Floats, places: Floats, width_px: float, furthest_px: float,
         width_px = float(np.clip(width_px + wider, 0.35, 8.0))
         settled = light.any() and max(abs(wider), np.median(np.abs(places - before))) < 0.01 * width_px
         light = np.where(all_light > DIM * usual, all_light, 0.0)
-        dark_noise = max(noise, MISSHAPEN * usual / (2 * np.pi * width_px**2))
+        # how well the shape of spots is known, relative to their peak; bright ones are not fitted by their
+        # wings
+        dark_noise = max(noise, 0.01 * usual / (2 * np.pi * width_px**2))
         glow.ravel()[pixels] = spots[:, :n] @ light
         residuals = counts - matrix @ solution
         growth = max(0.0, float((residuals**2 - noise**2).sum() / max(glow.sum(), 1e-30)))

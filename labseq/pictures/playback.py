@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +35,6 @@ Fate = Literal["kept", "ejected", "lost", "missing"]
 
 SITE_0_HZ, SITE_HZ = 1e9, 1e6
 """Frequency of the tone of site 0, and from site to site, in the programs that places are read from."""
-N_PIECES: Final = 12
-"""Straight pieces for a segment in which the speed changes."""
-LASTS_S: Final = 20.0
-"""Longest time that an animation takes, except of motion that takes longer than a second."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +147,8 @@ class Playback:
     def speed(self) -> float:
         """Motion that is shown in a second, in seconds: 1, 2 or 5 times a power of ten, at least 0.1 ms."""
         steps = (factor * 10.0**power for power in range(-4, -1) for factor in (1, 2, 5))
-        return next((step for step in steps if self.end_s - self.start_s <= LASTS_S * step), 0.05)
+        # longest time that an animation takes, except of motion that takes longer than a second
+        return next((step for step in steps if self.end_s - self.start_s <= 20.0 * step), 0.05)
 
     def trails(self, t_s: float) -> list[Floats]:
         """The ways of the atoms in the batch that is played, until a time: float64 (n, 2) each, in sites."""
@@ -257,7 +254,8 @@ def _pieces(program: ToneProgram, segment: int, joint_s: Floats) -> Iterator[tup
     """Knots of a segment: time, and the fractions of its duration and of the ways that have passed."""
     course = FrequencyCourse(int(program.course[segment]))
     first_s, last_s = joint_s[segment : segment + 2].tolist()
-    for u in np.linspace(0.0, 1.0, 2 if course is FrequencyCourse.LINEAR else N_PIECES + 1).tolist():
+    # 12 straight pieces for a segment in which the speed changes
+    for u in np.linspace(0.0, 1.0, 2 if course is FrequencyCourse.LINEAR else 13).tolist():
         yield first_s + u * (last_s - first_s), u, course.fraction(u)
 
 

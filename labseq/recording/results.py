@@ -31,12 +31,8 @@ ARRAY: Final = "array"
 """Key of a line in place of a large array, with the name of the dataset."""
 AGAIN: Final = "again"
 _SUFFIX: Final = ".jsonl"
-MAX_IN_LINE: Final = 1000
-"""Numbers that an array in a line may have; a larger one is in a file of its own."""
 MAX_TEXT: Final = 1_000_000
 """Size of a line, in bytes."""
-LONGEST_LINE: Final = 1 << 28
-"""Longest line that is read over, in bytes: earlier versions of labseq wrote large arrays as lines."""
 
 
 def results_file(run_dir: Path, name: str) -> Path:
@@ -114,7 +110,8 @@ class ResultsLog:
 
 
 def _is_large(value: object) -> bool:
-    return isinstance(value, np.ndarray) and value.size > MAX_IN_LINE
+    # numbers that an array in a line may have; a larger one is in a file of its own
+    return isinstance(value, np.ndarray) and value.size > 1000
 
 
 def _checked(value: Any, what: str) -> Any:
@@ -200,7 +197,8 @@ class Results:
     """
 
     def __init__(self, path: Path) -> None:
-        self._lines = NewLines(path, LONGEST_LINE)
+        # longest line that is read over, in bytes: earlier versions of labseq wrote large arrays as lines
+        self._lines = NewLines(path, 1 << 28)
         self.rows: dict[int, dict[str, Any]] = {}
         self.about: dict[str, Any] = {}
 

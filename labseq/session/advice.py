@@ -15,8 +15,6 @@ from labseq.sequencer.lab import Lab
 from labseq.session.prepared import PreparedRun
 from labseq.session.rehearsal import first_window_s
 
-CLEARLY: Final = 0.8
-"""Another planner is worth a line if it leaves at most this part of the defects, and half a defect less."""
 N_LOADINGS: Final = 12
 """Number of random loadings for which the two are compared."""
 
@@ -51,7 +49,8 @@ def better_planner(run: PreparedRun, lab: Lab) -> str:
         return ""
     finally:
         guard.end()
-    if then.n_defects > min(CLEARLY * now.n_defects, now.n_defects - 0.5):
+    # another planner is worth a line if it leaves at most this part of the defects, and half a defect less
+    if then.n_defects > min(0.8 * now.n_defects, now.n_defects - 0.5):
         return ""
     there, here = f"{then.n_defects:.1f} defects after one cycle", f"{now.n_defects:.1f}, {now}"
     return f"`auto`, which is {choice}: {there}, {then}; here {here}"

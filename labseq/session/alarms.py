@@ -22,12 +22,8 @@ from labseq.model import ShotRecord, follow_atoms
 from labseq.sequencer.clock import CLOCK_SET, SLEPT
 from labseq.units import format_quantity
 
-COMPARED: Final = 20
-"""Maximum number of earlier shots whose loading a shot is compared with."""
 LEAST_COMPARED: Final = 10
 """Minimum number: the mean of fewer is too uncertain."""
-SIGMAS: Final = 5.0
-"""How far a loading must be below its mean, in standard deviations: few sites often load half of the mean."""
 LEAST_ATOMS: Final = 100
 """Minimum number of sites, or of moved atoms, to judge a share by: those of few occur by chance."""
 LEAST_CONFIDENCES: Final = 1000
@@ -76,7 +72,8 @@ class Alarms:
         self._in_a_row: dict[str, int] = {}
         self._texts: dict[str, str] = {}
         self._frame: NDArray[np.uint16] | None = None
-        self._loadings = defaultdict[str, deque[int]](lambda: deque(maxlen=COMPARED))
+        # maximum number of earlier shots whose loading a shot is compared with
+        self._loadings = defaultdict[str, deque[int]](lambda: deque(maxlen=20))
         self._atoms, self._full = Latest(LEAST_ATOMS), Latest(self._settings.full)
         self._confidences = defaultdict[int, Latest](lambda: Latest(LEAST_CONFIDENCES))
         self._arrived = Latest(LEAST_ATOMS)
@@ -144,7 +141,9 @@ class Alarms:
         others = self._loadings[repr(shot.parameters)]
         if len(others) >= LEAST_COMPARED:
             mean = float(np.mean(others))
-            least = mean - SIGMAS * math.sqrt(mean * (1.0 - mean / n_sites))
+            # how far a loading must be below its mean, in standard deviations: few sites often load half of
+            # the mean
+            least = mean - 5.0 * math.sqrt(mean * (1.0 - mean / n_sites))
             if n_atoms < min(settings.loading * mean, least):
                 yield "loading", f"{_atoms(n_atoms)} loaded, {mean:.3g} on average in the shots before"
                 return  # shots after a failure are compared with those before it

@@ -36,8 +36,6 @@ FAILED: Final = "failed: "
 """Lines of an analysis's log with this prefix are shown as warnings of the run."""
 GRACE_S: Final = 2.0
 """Extra time for a process to exit before it is killed, in seconds."""
-MAX_START_S: Final = 60.0
-"""Time for the process of an analysis to start, before it counts as late, in seconds."""
 LOOK_S: Final = 0.02
 """Interval between two readings of results that the run waits for, in seconds."""
 MAX_READ: Final = 1 << 16
@@ -256,7 +254,8 @@ class _AnalysisProcess:
             is_running, now_s = self._process.poll() is None, time.monotonic()
             self._results.read()
             # the time that it has begins with its first result: starting takes seconds
-            if self._size() == self._size_before and now_s < self._start_s + MAX_START_S:
+            # time for the process of an analysis to start, before it counts as late, in seconds
+            if self._size() == self._size_before and now_s < self._start_s + 60.0:
                 asked_s = now_s
             found = {shot: self._results.rows[shot] for shot in shots if shot in self._results.rows}
             if len(found) == len(shots) or not is_running or now_s > asked_s + self._finish_within_s:

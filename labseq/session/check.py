@@ -41,10 +41,6 @@ N_LOADINGS_ELSEWHERE: Final = 20
 """The same for later points of a scan; windows are judged by a quarter of it at least."""
 MAX_WAIT_S: Final = 2.0
 """Time after which no further loading is tried, in seconds of real time; of all others together the same."""
-SHOT_OVERHEAD_BYTES: Final = 60_000
-"""Approximate size of a shot file without images, in bytes."""
-BYTES_PER_SITE: Final = 13
-"""What the file holds of each site on an image: occupancy, confidence, signal."""
 
 Timeline: TypeAlias = Sequence[tuple[str, Sequence[TimelineEntry]]]
 """Name and bars of each step."""
@@ -616,8 +612,10 @@ def _shot_bytes(assembly: Assembly, lab: Lab, bars: Sequence[TimelineEntry]) -> 
     kept = {"all": n_images, "last": min(1, n_images), "none": 0}[assembly.sequence.record_frames]
     if shape is None and kept:
         return None
-    per_image = BYTES_PER_SITE * lab.grid.n_rows * lab.grid.n_cols
-    return SHOT_OVERHEAD_BYTES + n_images * per_image + kept * 2 * math.prod(shape or (0,))
+    # what the file holds of each site on an image: occupancy, confidence, signal
+    per_image = 13 * lab.grid.n_rows * lab.grid.n_cols
+    # approximate size of a shot file without images, in bytes
+    return 60_000 + n_images * per_image + kept * 2 * math.prod(shape or (0,))
 
 
 def _disk_warnings(run: PreparedRun, shot_bytes: int, free_bytes: int) -> Iterator[Problem]:

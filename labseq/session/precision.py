@@ -30,9 +30,6 @@ from labseq.recording.index import IndexRow
 
 MAX_FIT_S: Final = 10.0
 """Maximum time for the fits of a quantity, in seconds."""
-GROWTH: Final = 1.05
-"""Growth of the number of shots between two fits: 5 % more shots reduce an error by 2.5 %, and a run of many
-shots makes only some dozens of fits."""
 
 
 class _Aim(NamedTuple):
@@ -109,7 +106,9 @@ class Precision:
         """Whether the fits are made now, after a whole round of the points; if so, sets when the next are."""
         is_due = self._n_shots >= self._next and not self._n_shots % len(self._points)
         if is_due:
-            self._next = GROWTH * self._n_shots
+            # growth of the number of shots between two fits: 5 % more shots reduce an error by 2.5 %, and a
+            # run of many shots makes only some dozens of fits
+            self._next = 1.05 * self._n_shots
         return is_due
 
     def _give_up(self, why: str) -> None:

@@ -19,8 +19,6 @@ from labseq.sequencer.lab import Lab
 
 SURVIVAL: Final = 0.98
 """Share of the atoms that a cycle of a rehearsal leaves; 97.66 % of the target in the paper, after one."""
-N_PROGRAMS: Final = 5
-"""Number of plans whose tones are computed."""
 
 
 class FirstCycle(NamedTuple):
@@ -101,7 +99,8 @@ def rehearse(
         what = f"it fails on a random loading of {100 * loading:.0f} % (seed {seed}): {error}"
         # only the first plan is made for the loading itself
         failure = Problem(what, hint="" if cycles else f"see it with: labseq plan {drawn} --seed {seed}")
-    plans = [cycle.plan for shot in shots for cycle in shot if cycle.plan.n_batches][:N_PROGRAMS]
+    # number of plans whose tones are computed
+    plans = [cycle.plan for shot in shots for cycle in shot if cycle.plan.n_batches][:5]
     rehearsals = [_summary(first_cycles) for first_cycles in zip(*shots, strict=True)]
     return rehearsals, plans, failure
 
