@@ -10,6 +10,7 @@ import errno
 import os
 import shutil
 import stat
+import time
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from io import BufferedReader
@@ -50,7 +51,7 @@ def whole_file(path: Path, *, alone: bool = False) -> Generator[IO[bytes]]:
             file.flush()
             os.fsync(file.fileno())
             file.close()  # Windows cannot rename an open file
-            part.replace(real)
+            _give_name(part, real)
         except BaseException:
             with suppress(OSError):  # closing flushes, which fails again on a full disk
                 file.close()
@@ -58,6 +59,19 @@ def whole_file(path: Path, *, alone: bool = False) -> Generator[IO[bytes]]:
                 part.unlink(missing_ok=True)
             raise
     sync_folder(real.parent)
+
+
+def _give_name(part: Path, real: Path) -> None:
+    """Rename a file that is whole; on Windows, wait until nobody reads the file that it replaces."""
+    attempts = 400 if os.name == "nt" else 1  # readers hold a file open for milliseconds
+    for attempt in range(1, attempts + 1):
+        try:
+            part.replace(real)
+            return
+        except PermissionError:
+            if attempt == attempts:
+                raise
+            time.sleep(0.005)
 
 
 def write_file(path: Path, data: bytes | memoryview) -> None:
