@@ -15,11 +15,10 @@ from labseq.plugin import (
     Context,
     DeviceError,
     DeviceTimeoutError,
-    LimitError,
     format_quantity,
 )
-from labseq.plugin.camera import CameraDriver, ExposureResult, Series, settle
-from labseq.plugin.messages import one_of
+from labseq.plugin.camera import ExposureResult, Series
+from labseq.plugin.sdk_camera import SdkCamera, without_rounding
 from labseq.plugin.units import ZERO_CELSIUS_K
 from labseq_andor.codes import (
     EXTERNAL,
@@ -56,17 +55,11 @@ TRIGGERS: Final[Mapping[str, tuple[int, TriggerModes]]] = {
 BULB_AND_TRANSFER: Final = Features.FTEXTERNALEXPOSURE | Features.KINETICEXTERNALEXPOSURE
 """Features of a camera that takes series with the bulb trigger and frame transfer."""
 
-ROUNDING: Final = 1e-6
-"""Relative error of the SDK's times, which are float32."""
-
-MAX_LENGTHENING: Final = 1.01
-"""An exposure may be longer than requested by at most this factor."""
-
 TEMPERATURE_PERIOD_S: Final = 1.0
 """How often the temperature is read while the sensor cools, in seconds."""
 
 
-class AndorCamera(CameraDriver):
+class AndorCamera(SdkCamera):
     """An Andor EMCCD camera, for example an iXon, through Andor's SDK2.
 
     The shutter is open from ``open()`` on, so that no frame waits for it, and closed in the safe state. EM
@@ -81,9 +74,8 @@ class AndorCamera(CameraDriver):
     """
 
     def __init__(self, settings: AndorSettings, context: Context) -> None:
-        super().__init__(context, settings.orientation)
+        super().__init__(settings, settings.cooling, context)
         self._settings = settings
-        self._cooling = settings.cooling
         self.connection = connection_for(settings, context)
         self._sensor_shape = self.connection.sensor_shape
         if self._sensor_shape is not None and (conflict := settings.sensor_conflict(self._sensor_shape)):
@@ -143,7 +135,7 @@ class AndorCamera(CameraDriver):
             self._reported = set_up(connection)
             height, width = self._reported["sensor_shape"]
             self._sensor_shape = (height, width)
-            self._readout_s = _without_rounding(sdk.GetReadOutTime(), self._readout_s)
+            self._readout_s = without_rounding(sdk.GetReadOutTime(), self._readout_s)
             self._max_exposure_s = min(settings.max_exposure, sdk.GetMaximumExposure())
         self._triggers = self._find_triggers()
         self._open_shutter()
@@ -155,20 +147,13 @@ class AndorCamera(CameraDriver):
         lacks_both = capabilities.ulFeatures & BULB_AND_TRANSFER != BULB_AND_TRANSFER
         if self._settings.frame_transfer and lacks_both and "bulb" in triggers:
             triggers.remove("bulb")
-        if (wanted := self._settings.line_trigger) not in triggers and wanted != "external":
-            text = f"this camera has no {wanted} trigger with these settings; it has {one_of(triggers)}"
-            raise DeviceError(self._name, f"{text}; set another `line_trigger`")
+        self._check_line_trigger(tuple(triggers))
         return tuple(triggers)
 
     def _disconnect(self) -> None:
         self.connection.close()
 
     # temperature
-
-    @property
-    def settling_timeout_s(self) -> float:
-        """Maximum time for cooling, in seconds; 0 without cooling."""
-        return 0.0 if self._cooling is None else self._cooling.timeout_s
 
     def settle(self) -> None:
         """Wait until the sensor is cold, and the camera also reports a stabilized temperature.
@@ -179,9 +164,8 @@ class AndorCamera(CameraDriver):
         cooling = self._cooling
         if cooling is None:
             return
-        self._check_open()
         start_s = self._clock.now()
-        settle(cooling, lambda: self._read_temperature()[1], self._clock, self._name)
+        super().settle()
         while (status := self._read_temperature()[0]) != Code.TEMP_STABILIZED:
             if self._clock.now() - start_s >= cooling.timeout_s:
                 waited = format_quantity(cooling.timeout_s, "time")
@@ -190,6 +174,9 @@ class AndorCamera(CameraDriver):
                     self._name, f"{text}; raise `timeout` of its cooling", cooling.timeout_s
                 )
             self._clock.sleep(TEMPERATURE_PERIOD_S)
+
+    def _read_temperature_k(self) -> float:
+        return self._read_temperature()[1]
 
     def _read_temperature(self) -> tuple[int, float]:
         """The SDK's status of the cooling, and the temperature in kelvins."""
@@ -202,10 +189,8 @@ class AndorCamera(CameraDriver):
     def _start(self, series: Series) -> None:
         with self.connection.selected() as sdk:
             exposure_s = self._set_series(sdk, series)
-        if exposure_s > MAX_LENGTHENING * series.exposure_s:
-            requested, shortest = (format_quantity(s, "time") for s in (series.exposure_s, exposure_s))
-            hint = "with frame transfer it cannot be shorter than the read-out"
-            raise LimitError(f"{self._name}: exposure", requested, f"at least {shortest}", hint)
+        hint = "with frame transfer it cannot be shorter than the read-out"
+        self._check_exposure(exposure_s, series.exposure_s, hint)
         self._set_em_gain(series.em_gain)
         self._open_shutter()
         self._clock.sleep(max(0.0, self._shutter_open_at_s - self._clock.now()))
@@ -234,15 +219,8 @@ class AndorCamera(CameraDriver):
             self._check_cycle(cycle_s)
         if series.trigger == "bulb":  # the line makes it, whatever is set
             exposure_s = series.exposure_s
-        self._set_for, self._exposure_s = wanted, _without_rounding(exposure_s, series.exposure_s)
+        self._set_for, self._exposure_s = wanted, without_rounding(exposure_s, series.exposure_s)
         return self._exposure_s
-
-    def _check_cycle(self, made_s: float) -> None:
-        wanted_s = self.facts.cycle_s
-        if _without_rounding(made_s, wanted_s) > wanted_s:
-            wanted, least = (format_quantity(s, "time") for s in (wanted_s, made_s))
-            what = f"{self._name}: cycle_time"
-            raise LimitError(what, wanted, f"at least {least} with this exposure and read-out")
 
     def _set_em_gain(self, em_gain: float) -> None:
         if self._reported["em_gain_range"] is not None:
@@ -352,8 +330,3 @@ class AndorCamera(CameraDriver):
 def _abort(sdk: AndorSdk) -> None:
     if sdk.GetStatus() == Code.ACQUIRING:
         sdk.AbortAcquisition()
-
-
-def _without_rounding(value: float, wanted: float) -> float:
-    """The SDK's float32 value, or the wanted one if they differ by rounding only."""
-    return wanted if abs(value - wanted) <= ROUNDING * abs(wanted) else value

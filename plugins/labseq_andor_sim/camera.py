@@ -50,7 +50,7 @@ class SimulatedCamera:
     ) -> None:
         self.faults = Faults()
         self.sensor = SimulatedSensor(world, clock)
-        self.head, self._clock = head, clock
+        self.head = head
         self._serial = serial
         self.cooler = Cooler(clock, self.faults)
         self.amplifiers = Amplifiers(head)
@@ -93,7 +93,7 @@ class SimulatedCamera:
 
     def trigger(self, t_s: float | None = None, width_s: float = 1e-3) -> bool:
         """A pulse at the trigger input, now or at ``t_s`` of the clock; False if it started no exposure."""
-        return self.acquisition.pulse(self._clock.now() if t_s is None else t_s, width_s)
+        return self.acquisition.pulse(t_s, width_s)
 
     def GetHeadModel(self) -> str:
         return self.head.model

@@ -16,7 +16,7 @@ from labseq_andor.heads import HEADS, IXON_897, Head
 from labseq_andor.sdk import SIGNATURES, AndorSdk
 from labseq_andor.settings import AndorSettings
 
-from labseq.plugin import ConfigError, Context, SensorMode, wait_for
+from labseq.plugin import ConfigError, Context, SensorMode
 from labseq.plugin.camera import ExposureResult
 from labseq.plugin.lines import trigger_line
 from labseq_andor_sim.camera import SimulatedCamera
@@ -63,21 +63,7 @@ class SimulatedConnection(AndorConnection):
 
     def wait(self, look: Callable[[float], ExposureResult | None], timeout_s: float) -> ExposureResult | None:
         """Wait on the session's clock until a frame is due, then in real time until the driver sees it."""
-        acquisition, start_s = self.camera.acquisition, self._clock.now()
-        expected, due_s = acquisition.n_fetched, acquisition.next_cycle_s
-        if due_s > start_s:
-            self._clock.sleep(min(due_s - start_s, timeout_s))
-        acquisition.proceed()
-        frame = self.camera.sensor.take(max(0.0, timeout_s - (self._clock.now() - start_s)))
-        if frame is None:
-            return look(0.0)
-        left_s = max(0.0, timeout_s - (self._clock.now() - start_s))
-        taken = wait_for(look, left_s, self._clock)
-        if taken is None:
-            return None
-        for _ in range(taken.number - expected):  # overwritten in the ring buffer, but not in the sensor
-            frame = self.camera.sensor.take(0.0) or frame
-        return replace(taken, t_start_s=frame.t_start_s)
+        return self.camera.acquisition.take(look, timeout_s)
 
 
 def simulated_head(settings: AndorSettings, sensor_shape: tuple[int, int]) -> Head:
