@@ -3,6 +3,7 @@
 The power of the spot (i, j) depends on the tone of row i and the tone of column j:
 ``P_ij = P f_i g_j (1 + e_ij)``. The factors f and g are the *separable* part, which the tones can
 make even; e is the rest, which they cannot change. Light shifts may be used instead of powers.
+Tweezers with a weight for each site, as an SLM makes, have no such rest.
 """
 
 from __future__ import annotations
@@ -57,23 +58,6 @@ class Factors:
         return float(np.sqrt((measured**2).sum() / max(1, n_free)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Equalised:
-    """Amplitudes that make the spots more even.
-
-    Attributes:
-        row_amplitudes: float64 (n_rows,), fractions of full scale.
-        column_amplitudes: float64 (n_cols,), likewise.
-        separable_spread: The rms of the separable part that was measured, relative.
-        residual_spread: The standard deviation of the part that the tones cannot change, relative.
-    """
-
-    row_amplitudes: Floats
-    column_amplitudes: Floats
-    separable_spread: float
-    residual_spread: float
-
-
 def factors(power: Floats) -> Factors:
     """Separate powers into factors of rows and columns: a two-way analysis of variance of their logarithms.
 
@@ -105,40 +89,6 @@ def factors(power: Floats) -> Factors:
     return Factors(fit[1 : 1 + n_rows], fit[1 + n_rows :], residual)
 
 
-def equalise(
-    power: Floats,
-    row_amplitudes: Floats,
-    column_amplitudes: Floats,
-    gain: float = 1.0,
-    max_sum: float = 1.0,
-) -> Equalised:
-    """Take the separable part out of the powers, which are taken as proportional to the amplitude squared.
-
-    The sum of an axis' amplitudes stays what it was, or comes down to ``max_sum``.
-
-    Args:
-        power: float64 (n_rows, n_cols), nan where nothing was measured.
-        row_amplitudes: float64 (n_rows,), those that the powers were measured at.
-        column_amplitudes: float64 (n_cols,), likewise.
-        gain: Fraction of the separable part to take out; below 1 a loop averages over noise.
-        max_sum: Largest sum of the amplitudes of an axis, as a fraction of full scale.
-
-    Raises:
-        DeviceError: A row or column has no light.
-        ValueError: Shapes do not match, or an amplitude is not above 0.
-    """
-    shape = (len(row_amplitudes), len(column_amplitudes))
-    if np.shape(power) != shape:
-        raise ValueError(f"powers of shape {np.shape(power)}; expected {shape}")
-    separated = factors(power)
-    return Equalised(
-        _corrected(row_amplitudes, separated.row, gain, max_sum),
-        _corrected(column_amplitudes, separated.column, gain, max_sum),
-        separated.separable_spread,
-        separated.residual_spread,
-    )
-
-
 def _corrected(amplitudes: Floats, logarithm: Floats, gain: float, max_sum: float) -> Floats:
     before = np.asarray(amplitudes, np.float64)
     if not np.all(before > 0):
@@ -161,6 +111,71 @@ def _refuse_dead(power: Floats, measured: NDArray[np.bool_]) -> None:
             lines = ", ".join(str(line) for line in dead[:5]) + (", ..." if len(dead) > 5 else "")
             message = f"no light on {name} {lines}: is its tone on, and are its spots where the camera looks?"
             raise DeviceError("static_tweezers", message)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """What follows from a measurement of the powers.
+
+    Attributes:
+        values: The values to play next.
+        spread: The rms of the part that they can change, relative.
+        residual_spread: The standard deviation of the rest, relative.
+        off: Logarithms of what each value is off by, like ``values``.
+    """
+
+    values: tuple[Floats, ...]
+    spread: float
+    residual_spread: float
+    off: tuple[Floats, ...]
+
+
+class Tones:
+    """How the powers follow the amplitudes of rows (n_rows,) and of columns (n_cols,)."""
+
+    names = ("row", "column")
+
+    def light(self, power: Floats) -> tuple[Floats, ...]:
+        """The light of each row and of each column."""
+        return power.sum(axis=1), power.sum(axis=0)
+
+    def correct(self, power: Floats, values: tuple[Floats, ...], limits: EqualiseSettings) -> Correction:
+        """Amplitudes that make the spots more even, as powers go with the amplitude squared.
+
+        The sum of an axis' amplitudes stays what it was, or comes down to ``max_sum``.
+
+        Raises:
+            DeviceError: A row or column has no light.
+            ValueError: An amplitude is not above 0.
+        """
+        separated = factors(power)
+        off = separated.row, separated.column
+        axes = zip(values, off, strict=True)
+        after = tuple(_corrected(each, by, limits.gain, limits.max_sum) for each, by in axes)
+        return Correction(after, separated.separable_spread, separated.residual_spread, off)
+
+
+class Sites:
+    """How the powers follow the weights of the sites, (n_rows, n_cols): in proportion."""
+
+    names = ("site",)
+
+    def light(self, power: Floats) -> tuple[Floats, ...]:
+        """The light of each site."""
+        return (power.ravel(),)
+
+    def correct(self, power: Floats, values: tuple[Floats, ...], limits: EqualiseSettings) -> Correction:
+        """Weights that make the spots more even, with a mean of 1; those of unmeasured sites stay.
+
+        Raises:
+            DeviceError: A row or column has no light.
+        """
+        measured = np.isfinite(power) & (power > 0)
+        _refuse_dead(power, measured)
+        off = np.log(power, out=np.zeros(power.shape), where=measured)
+        off = np.where(measured, off - off[measured].mean(), 0.0)
+        weights = values[0] * np.exp(-limits.gain * off)
+        return Correction((weights / weights.mean(),), float(np.std(off[measured])), 0.0, (off,))
 
 
 PATIENCE: Final = 4
@@ -194,14 +209,15 @@ class LoopResult:
     """The result of the loop.
 
     Attributes:
-        equalised: The amplitudes now in use, and the spreads measured at them; both spreads include
-            the noise of the measurement.
-        noise: The noise in the separable spread.
-        spreads: Separable spread of each round, the last one included.
+        values: Amplitudes of rows and columns now in use, or the weights of the sites.
+        residual_spread: The standard deviation of the part that they cannot change, relative.
+        noise: The noise in the last of the spreads; both spreads include it.
+        spreads: Spread of each round, the last one included, of the part that they can change.
         n_measured: Measurements in all.
     """
 
-    equalised: Equalised
+    values: tuple[Floats, ...]
+    residual_spread: float
     noise: float
     spreads: tuple[float, ...]
     n_measured: int
@@ -209,53 +225,52 @@ class LoopResult:
 
 def equalise_loop(
     measure: Callable[[], Floats],
-    apply: Callable[[Floats, Floats], None],
-    row_amplitudes: Floats,
-    column_amplitudes: Floats,
+    apply: Callable[..., None],
+    values: tuple[Floats, ...],
     limits: EqualiseSettings | None = None,
+    control: Tones | Sites | None = None,
 ) -> LoopResult:
-    """Measure and correct until the separable part of the powers is even.
+    """Measure and correct until the part of the powers that can be changed is even.
 
     Each round averages measurements until their noise, estimated from their own scatter, is a third
     of the target spread, or of the spread that the round is expected to leave.
 
     Args:
         measure: Measures the power of each spot once, float64 (n_rows, n_cols), nan where it cannot.
-        apply: Plays amplitudes of rows and columns.
-        row_amplitudes: float64 (n_rows,), where to begin.
-        column_amplitudes: float64 (n_cols,), likewise.
+        apply: Plays such values.
+        values: Where to begin: amplitudes of rows (n_rows,) and of columns (n_cols,), or the weights of the
+            sites (n_rows, n_cols).
         limits: Target spread, gain, and when to end.
+        control: How the powers follow them; None: as those of tones.
 
     Raises:
         DeviceError: The loop does not converge, and why: a tone without light, too much
             noise and how many averages it would take, or a spread that does not fall.
     """
-    limits = limits or EqualiseSettings()
-    rows, cols = (np.array(each, np.float64) for each in (row_amplitudes, column_amplitudes))
+    limits, control = limits or EqualiseSettings(), control or Tones()
     spreads: list[float] = []
     n_measured = 0
     while len(spreads) < limits.max_rounds:
-        apply(rows, cols)
+        apply(*values)
         # 0.3 is the part of the spread that is expected to remain after a round
         noise_limit = 1 / 3 * max(limits.spread, 0.3 * spreads[-1] if spreads else 0.0)
-        power, noise, n = _average(measure, noise_limit, limits.max_averages)
+        power, noise, n = _average(measure, control, noise_limit, limits.max_averages)
         n_measured += n
-        corrected = equalise(power, rows, cols, limits.gain, limits.max_sum)
-        spreads.append(corrected.separable_spread)
-        if corrected.separable_spread <= limits.spread:
-            measured = Equalised(rows, cols, corrected.separable_spread, corrected.residual_spread)
-            return LoopResult(measured, noise, tuple(spreads), n_measured)
-        _refuse_standstill(spreads, power, rows, cols)
-        rows, cols = corrected.row_amplitudes, corrected.column_amplitudes
+        corrected = control.correct(power, values, limits)
+        spreads.append(corrected.spread)
+        if corrected.spread <= limits.spread:
+            return LoopResult(values, corrected.residual_spread, noise, tuple(spreads), n_measured)
+        _refuse_standstill(spreads, control, values, corrected.off)
+        values = corrected.values
     return _refuse(f"the separable spread is {spreads[-1]:.2%} after {len(spreads)} rounds")
 
 
 def _average(
-    measure: Callable[[], Floats], noise_limit: float, max_averages: int
+    measure: Callable[[], Floats], control: Tones | Sites, noise_limit: float, max_averages: int
 ) -> tuple[Floats, float, int]:
-    """The mean of enough measurements, the noise of its separable part, and how many there were."""
+    """The mean of enough measurements, the noise of what can be changed, and how many there were."""
     mean = np.asarray(measure(), np.float64)
-    shares, noise = [_shares(mean)], math.inf
+    shares, noise = [_shares(mean, control)], math.inf
     while noise > noise_limit:
         n = len(shares)
         if n >= max_averages:
@@ -266,43 +281,48 @@ def _average(
             )
         power = np.asarray(measure(), np.float64)
         mean = mean + (power - mean) / (n + 1)
-        shares.append(_shares(power))
-        noise = _noise(np.array(shares), len(mean))
+        shares.append(_shares(power, control))
+        noise = _noise(shares)
     return mean, noise, len(shares)
 
 
-def _shares(power: Floats) -> Floats:
-    """The part of all light that each row and each column has, float64 (n_rows + n_cols,)."""
+def _shares(power: Floats, control: Tones | Sites) -> tuple[Floats, ...]:
+    """The part of all light that each row and each column has, or that each site has."""
     light = np.where(np.isfinite(power), power, 0.0)
-    return np.concatenate([light.sum(axis=1), light.sum(axis=0)]) / max(float(light.sum()), 1e-300)
+    return tuple(each / max(float(light.sum()), 1e-300) for each in control.light(light))
 
 
-def _noise(shares: Floats, n_rows: int) -> float:
-    """The rms of the separable part of a mean of measurements that is due to noise, from their scatter.
+def _noise(shares: list[tuple[Floats, ...]]) -> float:
+    """The rms of what can be changed of a mean of measurements that is due to noise, from their scatter.
 
     Args:
-        shares: float64 (n_measurements, n_rows + n_cols), those of rows and columns in each measurement.
-        n_rows: Number of rows.
+        shares: Those of rows and of columns, or of sites, in each measurement.
     """
-    mean, variance = shares.mean(axis=0), shares.var(axis=0, ddof=1)
-    lit = mean > DEAD * np.median(mean)  # `factors` refuses the others
-    relative = np.where(lit, variance, 0.0) / np.where(lit, mean, 1.0) ** 2
-    return math.sqrt(float(relative[:n_rows].mean() + relative[n_rows:].mean()) / len(shares))
+    total = 0.0
+    for each in zip(*shares, strict=True):
+        mean, variance = np.mean(each, axis=0), np.var(each, axis=0, ddof=1)
+        lit = mean > DEAD * np.median(mean)  # those without light are refused later
+        total += float(np.mean(np.where(lit, variance, 0.0) / np.where(lit, mean, 1.0) ** 2))
+    return math.sqrt(total / len(shares))
 
 
-def _refuse_standstill(spreads: list[float], power: Floats, rows: Floats, cols: Floats) -> None:
+def _refuse_standstill(
+    spreads: list[float], control: Tones | Sites, values: tuple[Floats, ...], off: tuple[Floats, ...]
+) -> None:
     if len(spreads) <= PATIENCE or spreads[-1] < 0.9 * spreads[-1 - PATIENCE]:
         return
-    separated = factors(power)
-    name, off, amplitudes = max(
-        (("row", separated.row, rows), ("column", separated.column, cols)),
-        key=lambda axis: np.abs(axis[1]).max(),
+    name, off_by, played = max(
+        zip(control.names, off, values, strict=True), key=lambda axis: np.abs(axis[1]).max()
     )
-    worst = int(np.abs(off).argmax())
+    place = np.unravel_index(int(np.abs(off_by).argmax()), off_by.shape)
+    worst = ", ".join(map(str, place))
+    share, cause = f"an amplitude of {played[place]:.3g} of full scale", "is an amplifier at its limit"
+    if off_by.ndim > 1:
+        worst, share, cause = f"({worst})", f"a weight of {played[place]:.3g}", "is another spot on it"
     _refuse(
         f"the separable spread stays at {spreads[-1]:.2%}; the spots of {name} {worst} have "
-        f"{math.exp(off[worst]):.3g} times the power of the others at an amplitude of "
-        f"{amplitudes[worst]:.3g} of full scale: do they follow it, or is an amplifier at its limit?"
+        f"{math.exp(off_by[place]):.3g} times the power of the others at {share}: "
+        f"do they follow it, or {cause}?"
     )
 
 
@@ -316,6 +336,8 @@ READINGS: Final = "equalise."
 
 class EqualiseStep(Step):
     """Measures the power of each static tweezer, and corrects the rows' and columns' tones until it is even.
+
+    Where the static tweezers have a weight for each site it corrects these instead.
 
     A camera measures, or another device of the profile; see :class:`labseq.builtin.spot_powers.TweezerMeter`.
     """
@@ -349,20 +371,29 @@ class EqualiseStep(Step):
             before.append(power) if not before else None
             return power
 
-        rows, cols = _mobile_in_force(shot) if is_mobile else _in_force(shot)
+        has_weights = not is_mobile and shot.static_tweezers.facts.control == "sites"
+        in_force = _mobile_in_force if is_mobile else _weights_in_force if has_weights else _in_force
         with shot.stage("equalise"):
-            result = equalise_loop(measure, meter.apply, rows, cols, settings)
+            control = Sites() if has_weights else Tones()
+            result = equalise_loop(measure, meter.apply, in_force(shot), settings, control)
             after = meter.measure()
-        equalised = result.equalised
-        shot.note(READINGS + "row_amplitudes", equalised.row_amplitudes.tolist())
-        shot.note(READINGS + "column_amplitudes", equalised.column_amplitudes.tolist())
-        shot.note(READINGS + "separable_spread", equalised.separable_spread)
-        shot.note(READINGS + "residual_spread", equalised.residual_spread)
+        names = ("weights",) if has_weights else ("row_amplitudes", "column_amplitudes")
+        for name, values in zip(names, result.values, strict=True):
+            shot.note(READINGS + name, values.tolist())
+        shot.note(READINGS + "separable_spread", result.spreads[-1])
+        shot.note(READINGS + "residual_spread", result.residual_spread)
         shot.note(READINGS + "noise", result.noise)
         shot.note(READINGS + "spreads", list(result.spreads))
         shot.note(READINGS + "n_measured", result.n_measured)
         shot.note(READINGS + "power_before", before[0].tolist())
         shot.note(READINGS + "power_after", after.tolist())
+
+
+def _weights_in_force(shot: Shot) -> tuple[Floats]:
+    """The weights to begin with: those of the calibration; else all equal."""
+    entry = shot.calibrations.get("tweezers")
+    weights = None if entry is None else entry.values.get("weights")
+    return (np.ones(shot.grid.shape) if weights is None else weights,)
 
 
 def _in_force(shot: Shot) -> tuple[Floats, Floats]:

@@ -183,14 +183,18 @@ class TweezerMeter:
         is_camera = self._device is None or hasattr(self._device, "arm")
         self._spots = SpotPowers(shot.grid, settings.device) if is_camera else None
         self._is_total = False
-        self._playing: tuple[Floats, Floats] | None = None
+        self._playing: tuple[Floats, ...] = ()
 
-    def apply(self, rows: Floats, cols: Floats) -> None:
-        """Play amplitudes of rows and columns, fractions of full scale."""
-        shot = self._shot
-        shot.call("static_tweezers", shot.call_timeout_s, shot.static_tweezers.load, (rows, cols))
+    def apply(self, *values: Floats) -> None:
+        """Play amplitudes of rows and columns, fractions of full scale; or weights of the sites."""
+        shot, static = self._shot, self._shot.static_tweezers
+        if len(values) == 1:
+            shot.call("static_tweezers", shot.call_timeout_s, static.load_weights, values[0])
+        else:
+            rows, cols = values
+            shot.call("static_tweezers", shot.call_timeout_s, static.load, (rows, cols))
         shot.clock.sleep(self._settings.settle)
-        self._playing = rows, cols
+        self._playing = values
 
     def measure(self) -> Floats:
         """Measure the powers once, float64 (n_rows, n_cols), in any unit.
@@ -210,7 +214,9 @@ class TweezerMeter:
 
     def _by_tone(self) -> Floats:
         """The products of the light of each row and of each column, less that without any."""
-        assert self._playing is not None
+        if len(self._playing) == 1:
+            text = f"its value '{self._settings.value}' is one number, the power of all tweezers"
+            raise DeviceError(self._settings.device, f"{text}; weights of sites need a camera, or an array")
         rows, cols = self._playing
         each_row, each_col = np.diag(rows), np.diag(cols)
         dark = self._total(0 * rows, 0 * cols)

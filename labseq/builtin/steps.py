@@ -109,6 +109,12 @@ class RampStep(Step):
     def __init__(self, settings: RampSettings) -> None:
         self.settings = settings
 
+    def check_devices(self, devices: Mapping[str, object], context: StepContext) -> Mapping[str, str]:
+        """Refuse the step where the static tweezers have one depth only."""
+        del devices
+        fault = "these static tweezers cannot be ramped: switch their light with a line or a device"
+        return {} if context.static_tweezers.ramps else {"": fault}
+
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
         """One entry."""
         duration_s, facts = self.settings.duration + context.margin_s("ramp"), context.static_tweezers

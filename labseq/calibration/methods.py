@@ -110,25 +110,40 @@ def _summary_lines(lattice: FoundLattice, n_frames: int) -> tuple[str, ...]:
 
 
 def analyse_tweezers(data: CalibrationData) -> AnalysisResult:
-    """Read the amplitudes that the step ``equalise`` found in the run's last shot.
+    """Read the amplitudes or weights that the step ``equalise`` found in the run's last shot.
 
     Raises:
         ConfigError: No shot of the run equalised the tweezers of this grid.
     """
     readings = _readings(data.run)
-    rows, cols, before, after = (
-        np.array(readings[name], np.float64)
-        for name in ("row_amplitudes", "column_amplitudes", "power_before", "power_after")
+    before, after = (np.array(readings[name], np.float64) for name in ("power_before", "power_after"))
+    if before.shape != data.hardware.grid.shape:
+        raise _wrong_run(data.run, f"it equalised {len(before)} x {len(before[0])} tweezers")
+    # the amplitudes of tweezers without tones are equal, so that every driver can read the calibration
+    equal = [[1 / n] * n for n in before.shape]
+    rows, cols = (
+        np.array(readings.get(name, value), np.float64)
+        for name, value in zip(("row_amplitudes", "column_amplitudes"), equal, strict=True)
     )
-    if (len(rows), len(cols)) != data.hardware.grid.shape:
-        raise _wrong_run(data.run, f"it equalised {len(rows)} x {len(cols)} tweezers")
+    values = {"row_amplitudes": rows, "column_amplitudes": cols}
+    weights = np.array(readings["weights"], np.float64) if "weights" in readings else None
     names = ("separable_spread", "residual_spread", "noise", "n_measured")
     quality = {name: float(readings[name]) for name in names}
     n_rounds = len(readings["spreads"])
     work = f"{n_rounds} round{'s' * (n_rounds > 1)}, {readings['n_measured']} measurements"
     spread = f"{quality['separable_spread']:.2%} (before: {readings['spreads'][0]:.2%})"
+    if weights is not None:
+        return AnalysisResult(
+            values | {"weights": weights},
+            quality,
+            (
+                f"{work}: sites are equal to {spread}",
+                f"the weights of the sites are {weights.min():.3g} to {weights.max():.3g}",
+            ),
+            draw=lambda: draw_powers(before, after, weights.mean(axis=1), weights.mean(axis=0), "weight (%)"),
+        )
     return AnalysisResult(
-        {"row_amplitudes": rows, "column_amplitudes": cols},
+        values,
         quality,
         (
             f"{work}: rows and columns are equal to {spread}",

@@ -161,7 +161,9 @@ def draw_tone_offsets(rows: tuple[Floats, Floats], columns: tuple[Floats, Floats
 SIZE_IN: Final = (8.4, 5.6)
 
 
-def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Figure:
+def draw_powers(
+    before: Floats, after: Floats, rows: Floats, cols: Floats, label: str = "tone (% of full scale)"
+) -> Figure:
     """Draw maps of the powers, relative to their means, and the resulting amplitudes.
 
     Args:
@@ -169,6 +171,7 @@ def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Fi
         after: float64 (n_rows, n_cols), powers at the end.
         rows: float64 (n_rows,), amplitudes of the rows' tones, fractions of full scale.
         cols: float64 (n_cols,), amplitudes of the columns' tones.
+        label: What the bars of rows and columns show; mean weights for tweezers without tones.
     """
     figure = make_figure(*SIZE_IN, layout="constrained")
     panels = figure.subplots(2, 2, height_ratios=(2.2, 1.0))
@@ -186,7 +189,7 @@ def draw_powers(before: Floats, after: Floats, rows: Floats, cols: Floats) -> Fi
     bar.set_label("deviation from the mean (%)")
     for axes, amplitudes, name in zip(panels[1], (rows, cols), ("row", "column"), strict=True):
         axes.bar(np.arange(len(amplitudes)), 100 * amplitudes, color="#1f4e8c")
-        axes.set(ylim=(0, 115 * float(amplitudes.max())), xlabel=name, ylabel="tone (% of full scale)")
+        axes.set(ylim=(0, 115 * float(amplitudes.max())), xlabel=name, ylabel=label)
         _count(axes.xaxis)
     return figure
 

@@ -45,7 +45,7 @@ class CalibrationEntry:
     - thresholds: ``thresholds`` (n_rows, n_cols), in the unit of the detector: counts over the
       offset, or log-odds.
     - tweezers: ``row_amplitudes`` (n_rows,), ``column_amplitudes`` (n_cols,) of the static tweezers' tones,
-      fractions of full scale.
+      fractions of full scale; of tweezers with a weight for each site also ``weights`` (n_rows, n_cols).
     - amplitudes: the same of the mobile tweezers' tones at the sites, above 0.
     - frequencies: ``row_hz`` (n_rows,), ``column_hz`` (n_cols,): the mobile tweezers' tones at the sites.
     - overlay: ``offset_m`` (2,): offset of the mobile tweezers from the sites, along a1 (along a
@@ -100,7 +100,8 @@ class CalibrationEntry:
         return same_grid(self.grid, grid_facts(grid))
 
     def _check_shapes(self) -> None:
-        for name, symbols in VALUE_SHAPES[self.kind].items():
+        weights = {"weights": ("rows", "cols")} if "weights" in self.values else {}
+        for name, symbols in {**VALUE_SHAPES[self.kind], **weights}.items():
             shape = tuple(symbol if isinstance(symbol, int) else self.grid[symbol] for symbol in symbols)
             if name not in self.values:
                 raise ValueError(f"'{name}' is missing")
@@ -111,6 +112,8 @@ class CalibrationEntry:
         for name, value in self.values.items():
             if name.endswith("_amplitudes") and not np.all((value >= 0) & (value <= 1)):
                 raise ValueError(f"'{name}' has values outside of 0 to 1")
+        if not np.all(self.values.get("weights", np.ones(1)) > 0):
+            raise ValueError("'weights' has values that are not above 0")
         if self.kind == "amplitudes" and any(
             not np.all(self.values[name] > 0) for name in VALUE_SHAPES[self.kind]
         ):

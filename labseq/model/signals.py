@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -258,11 +259,16 @@ class TweezersFacts:
         resolution_s: Step of the clock that times their ramps and releases.
         shortest_release_s: Shortest time for which they can turn their light off; inf: they cannot.
         latency_s: Typical time from the call of ``ramp`` to its start at the outputs.
+        control: What labseq can set: "tones" of rows and columns (``load``), "sites" with a weight each
+            (``load_weights``), or "nothing".
+        ramps: Whether they can have depths between off and nominal.
     """
 
     resolution_s: float = 0.0
     shortest_release_s: float = math.inf
     latency_s: float = 0.0
+    control: Literal["tones", "sites", "nothing"] = "tones"
+    ramps: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,15 +279,20 @@ class TweezerAmplitudes:
         row: float64 (n_rows,).
         column: float64 (n_cols,).
         dark_s: How long the light was off just before, in seconds.
+        site: float64 (n_rows, n_cols), power of each tweezer where no tones make it, relative to the nominal
+            power; None: it follows from the tones.
     """
 
     row: NDArray[np.float64]
     column: NDArray[np.float64]
     dark_s: float = 0.0
+    site: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "row", read_only(self.row, np.float64, (-1,), "row"))
         object.__setattr__(self, "column", read_only(self.column, np.float64, (-1,), "column"))
+        if self.site is not None:
+            object.__setattr__(self, "site", read_only(self.site, np.float64, (-1, -1), "site"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,9 +16,11 @@ from labseq.roles import Context
 __all__ = [
     "Amplitudes",
     "calibrated_amplitudes",
+    "calibrated_weights",
     "check_amplitudes",
     "check_ramp",
     "check_tone_program",
+    "check_weights",
 ]
 
 Floats = NDArray[np.float64]
@@ -138,6 +140,28 @@ def check_amplitudes(name: str, amplitudes: Amplitudes, shape: tuple[int, int]) 
             raise LimitError(f"{name}: shape of the {axis} amplitudes", values.shape, (n_tones,))
         if not (np.isfinite(values).all() and (values >= 0).all()):
             raise LimitError(f"{name}: a {axis} amplitude", "negative or not finite", "0 or more")
+
+
+def calibrated_weights(context: Context) -> Floats:
+    """Weight of each site by the active calibration, float64 (n_rows, n_cols), with a mean of 1.
+
+    All are 1 without a calibration, and with that of an array of tones, which says nothing of the sites.
+    """
+    calibration = context.calibrations.get("tweezers")
+    weights = None if calibration is None else calibration.values.get("weights")
+    return np.ones(context.grid.shape) if weights is None else weights / weights.mean()
+
+
+def check_weights(name: str, weights: Floats, shape: tuple[int, int]) -> None:
+    """Refuse weights of static tweezers unless there is one above 0 for each of (n_rows, n_cols).
+
+    Raises:
+        LimitError: They are of another shape, not above 0 or not finite.
+    """
+    if weights.shape != shape:
+        raise LimitError(f"{name}: shape of the weights", weights.shape, shape)
+    if not (np.isfinite(weights).all() and (weights > 0).all()):
+        raise LimitError(f"{name}: a weight", "not above 0 or not finite", "more than 0")
 
 
 def check_ramp(name: str, depth: float, duration_s: float, deepest: float) -> None:

@@ -29,7 +29,7 @@ _COMMON: Final = frozenset(
 )
 METHODS: Final[Mapping[str, frozenset[str]]] = {
     "camera": _COMMON | {"arm", "disarm", "trigger", "read"},
-    "static_tweezers": _COMMON | {"load", "start", "ramp", "release", "leave_on"},
+    "static_tweezers": _COMMON | {"load", "load_weights", "start", "ramp", "release", "leave_on"},
     "mobile_tweezers": _COMMON | {"check_program", "prepare", "play", "wait", "prepare_beginning", "append"},
     "device": _COMMON | {"command", "read", "check_command"},
     "lines": _COMMON | {"check_program", "idle", "compile", "arm", "fire", "wait"},

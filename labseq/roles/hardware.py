@@ -187,15 +187,23 @@ class StaticTweezers(Hardware):
 
     @property
     def facts(self) -> TweezersFacts:
-        """How well it times ramps, and whether it can release the atoms; also before ``open()``."""
+        """What labseq can set, how ramps are timed, whether atoms can be released; also before ``open()``."""
         return TweezersFacts()
 
     @abstractmethod
     def load(self, amplitudes: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> None:
         """Set the tone amplitudes of the rows (n_rows,) and columns (n_cols,).
 
-        Fractions of full scale; None means the calibrated ones.
+        Fractions of full scale; None means the calibrated ones, also of weights. Called with amplitudes only
+        if ``facts.control`` is "tones".
         """
+
+    def load_weights(self, weights: NDArray[np.float64]) -> None:
+        """Set the share of the light that each site is to have, float64 (n_rows, n_cols).
+
+        Only their ratios count. Called only if ``facts.control`` is "sites".
+        """
+        raise NotImplementedError("these static tweezers have no weight for each site")
 
     @abstractmethod
     def start(self) -> None:
@@ -206,7 +214,11 @@ class StaticTweezers(Hardware):
 
     @abstractmethod
     def ramp(self, depth: float, duration_s: float) -> None:
-        """Change the depth linearly, to a fraction of the nominal depth."""
+        """Change the depth linearly, to a fraction of the nominal depth.
+
+        Raises:
+            LimitError: A depth that they cannot have; without ``facts.ramps`` any but 0 and 1.
+        """
 
     def release(self, duration_s: float) -> float:
         """Turn the light off for a time that the device itself keeps, then on again at the same depth.

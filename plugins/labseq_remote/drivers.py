@@ -125,6 +125,7 @@ class RemoteStaticTweezers(RemoteHardware, StaticTweezers):
     _kind = "static_tweezers"
     facts = known("facts", TweezersFacts())
     load = called("load")
+    load_weights = called("load_weights")
     start = called("start")
     ramp = called("ramp")
     release = called("release")

@@ -33,14 +33,15 @@ class StaticArray:
     At full power the depth of a site is the product of the powers of its row tone and its column tone, of
     the AODs' response to these tones (``tone_response``), and of the site's own disorder
     (``depth_disorder``), which no choice of amplitudes corrects. The power of a tone is proportional to its
-    amplitude squared; equal amplitudes that add up to full scale give the nominal depth.
+    amplitude squared; equal amplitudes that add up to full scale give the nominal depth. Where no tones make
+    the tweezers, their powers come in place of those of tones and response.
     """
 
     def __init__(self, grid: SiteGrid, settings: SimulationSettings) -> None:
         self._grid, self._settings = grid, settings
         self._site: Floats = np.ones(grid.shape)
         self._response: tuple[Floats, Floats] = np.ones(grid.n_rows), np.ones(grid.n_cols)
-        self._power: tuple[Floats, Floats] = self._response
+        self._power: Floats = self._site
         self._level = 0.0
         self._is_blocked = False
         self._source: ToneSource | None = None
@@ -54,14 +55,13 @@ class StaticArray:
             np.exp(self._settings.tone_response * random.standard_normal(n)) for n in (n_rows, n_cols)
         )
         self._response = row, col
-        self._power = np.ones(n_rows), np.ones(n_cols)
+        self._power = np.outer(row, col)
         self._level = 0.0
 
     @property
     def depth(self) -> Floats:
         """Depth of each site now, float64 (n_rows, n_cols)."""
-        rows, cols = (power * response for power, response in zip(self._power, self._response, strict=True))
-        return (0.0 if self._is_blocked else self._level) * self._site * rows[:, None] * cols
+        return (0.0 if self._is_blocked else self._level) * self._site * self._power
 
     def holds(self) -> NDArray[np.bool_]:
         """Which sites are deep enough to hold an atom, bool (n_rows, n_cols)."""
@@ -74,8 +74,7 @@ class StaticArray:
 
     def connect_outputs(self, source: ToneSource) -> None:
         """From now on the depths follow what these outputs play."""
-        rows, cols = self._grid.shape
-        self._power = np.zeros(rows), np.zeros(cols)
+        self._power = np.zeros(self._grid.shape)
         self._source, self._level = source, 1.0
 
     def receive_until(self, until_s: float, atoms: Atoms, rng: np.random.Generator) -> Counter[str]:
@@ -94,9 +93,13 @@ class StaticArray:
         return lost
 
     def drive(self, amplitudes: TweezerAmplitudes) -> None:
-        """Set the amplitudes of the tones."""
-        rows, cols = amplitudes.row, amplitudes.column
-        self._power = (rows * len(rows)) ** 2, (cols * len(cols)) ** 2
+        """Set the amplitudes of the tones, or the powers of the sites."""
+        if amplitudes.site is not None:
+            self._power = amplitudes.site
+            return
+        tones = zip((amplitudes.row, amplitudes.column), self._response, strict=True)
+        rows, cols = ((each * len(each)) ** 2 * response for each, response in tones)
+        self._power = np.outer(rows, cols)
 
     def block(self, atoms: Atoms, *, is_blocked: bool) -> int:
         """Block the light by a line that turns it off, or let it pass.

@@ -15,7 +15,8 @@ from labseq.builtin.equalise import (
     EqualiseSettings,
     EqualiseStep,
     LoopResult,
-    equalise,
+    Sites,
+    Tones,
     equalise_loop,
     factors,
 )
@@ -230,11 +231,11 @@ def test_one_step_makes_powers_of_squared_amplitudes_even(shape: tuple[int, int]
     def power(rows: Any, cols: Any) -> Any:
         return np.outer(bias_row * rows**2, bias_col * cols**2)
 
-    step = equalise(power(rows, cols), rows, cols)
-    even = power(step.row_amplitudes, step.column_amplitudes)
+    step = Tones().correct(power(rows, cols), (rows, cols), EqualiseSettings(gain=1.0))
+    even = power(*step.values)
     assert even == pytest.approx(np.full(shape, even[0, 0]), rel=1e-9)
-    assert step.row_amplitudes.sum() == pytest.approx(rows.sum())
-    assert step.column_amplitudes.sum() == pytest.approx(cols.sum())
+    for before, after in zip((rows, cols), step.values, strict=True):
+        assert after.sum() == pytest.approx(before.sum())
 
 
 @pytest.mark.parametrize("light", [1e-3, -0.01, np.nan])
@@ -280,7 +281,7 @@ class Array:
 
 def begin(array: Array, limits: EqualiseSettings | None = None) -> LoopResult:
     rows, cols = array.start()
-    return equalise_loop(array.measure, array.apply, rows, cols, limits)
+    return equalise_loop(array.measure, array.apply, (rows, cols), limits)
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([(20, 20), (12, 30)]))
@@ -293,8 +294,8 @@ def test_the_separable_part_is_made_even_and_the_rest_is_left_alone(
     found = factors(array.power())
     assert found.separable_spread < 0.0055
     assert found.residual_spread == pytest.approx(0.04, rel=0.2)
-    assert result.equalised.residual_spread == pytest.approx(found.residual_spread, rel=0.2)
-    assert result.equalised.separable_spread <= 0.005
+    assert result.residual_spread == pytest.approx(found.residual_spread, rel=0.2)
+    assert result.spreads[-1] <= 0.005
     assert result.noise <= 0.005 / 3
     assert result.spreads[0] > 10 * result.spreads[-1]
 
@@ -333,5 +334,35 @@ def test_amplitudes_beyond_full_scale_bring_the_others_down() -> None:
     array.bias[0][:] = 1.0, 0.1
     array.apply = lambda rows, cols: setattr(array, "amplitudes", [rows, cols])
     limits = EqualiseSettings(max_sum=2.0)
-    result = equalise_loop(array.measure, array.apply, np.ones(2), np.full(3, 1 / 3), limits)
-    assert result.equalised.row_amplitudes == pytest.approx([0.1**0.5, 1.0], rel=0.02)
+    result = equalise_loop(array.measure, array.apply, (np.ones(2), np.full(3, 1 / 3)), limits)
+    assert result.values[0] == pytest.approx([0.1**0.5, 1.0], rel=0.02)
+
+
+def test_weights_of_sites_make_every_site_even_also_where_a_spot_answers_by_less_than_its_weight() -> None:
+    rng = np.random.default_rng(4)
+    bias, weights = np.exp(rng.normal(0, 0.1, (6, 8))), np.ones((6, 8))
+    exponent = np.where(bias > 1.1, 0.8, 1.0)
+
+    def apply(played: Floats) -> None:
+        weights[...] = played
+
+    def measure() -> Floats:
+        return 300.0 * bias * weights**exponent * (1 + 0.007 * rng.normal(size=weights.shape))
+
+    result = equalise_loop(measure, apply, (np.ones((6, 8)),), control=Sites())
+    even = bias * weights**exponent
+    assert result.spreads[0] > 0.08
+    assert np.std(even) < 0.006 * even.mean()
+    assert result.noise <= 0.005 / 3
+    assert weights.mean() == pytest.approx(1.0)
+
+
+def test_a_site_that_does_not_follow_its_weight_is_named() -> None:
+    weights = np.ones((6, 8))
+
+    def apply(played: Floats) -> None:
+        weights[...] = played
+        weights[2, 3] = 1.5
+
+    with pytest.raises(DeviceError, match=r"the spots of site \(2, 3\) have 1\.\d+ times .* a weight of 0"):
+        equalise_loop(lambda: weights, apply, (np.ones((6, 8)),), control=Sites())

@@ -36,8 +36,9 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
         """Turn on, lower, raise."""
         device.load(None)
         device.start()
-        device.ramp(0.5, self.ramp_s)
-        device.ramp(1.0, self.ramp_s)
+        if device.facts.ramps:
+            device.ramp(0.5, self.ramp_s)
+            device.ramp(1.0, self.ramp_s)
 
     def ready(self, device: StaticTweezers) -> None:
         """Turn on."""
@@ -56,7 +57,8 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
 
         def lower(tweezers: StaticTweezers) -> None:
             tweezers.start()
-            tweezers.ramp(0.2, self.ramp_s)
+            if tweezers.facts.ramps:
+                tweezers.ramp(0.2, self.ramp_s)
 
         return {
             "with amplitudes loaded": lambda tweezers: tweezers.load(None),
@@ -97,6 +99,8 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
         """Each shot begins at full depth, whatever happened in the last one."""
         with self.opened(factory) as (tweezers, context):
             tweezers.start()
+            if not tweezers.facts.ramps:
+                return
             tweezers.ramp(0.5, self.ramp_s)
             before = _n_played(context)
             with doing("start() after a ramp to half the depth"):
@@ -105,11 +109,14 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
             assert depth == 1.0, f"the depth is {depth} after start(); expected 1"
             assert not before or _n_played(context) > before, "start() after a ramp played nothing"
 
-    @promise("ramp() takes every depth from 0 to 1, and a duration of 0")
+    @promise("ramp() takes every depth from 0 to 1, and a duration of 0; none between if `facts` say so")
     def test_ramps(self, factory: Factory[StaticTweezers]) -> None:
         """Down to 0 and back."""
         with self.opened(factory) as (tweezers, _):
             tweezers.start()
+            if not tweezers.facts.ramps:
+                refusal(LimitError, "ramp(0.5)", tweezers.ramp, 0.5, self.ramp_s)
+                return
             for depth, duration_s in ((0.5, self.ramp_s), (0.0, self.ramp_s), (1.0, self.ramp_s), (0.3, 0.0)):
                 with doing(f"ramp({depth}, {duration_s})"):
                     tweezers.ramp(depth, duration_s)
@@ -133,13 +140,37 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
             for duration_s in (-wanted_s, 0.0, float("nan")):
                 refusal(LimitError, f"release({duration_s})", tweezers.release, duration_s)
 
+    @promise("load_weights(), if `facts` offer it, takes a weight above 0 for each site")
+    def test_loads_weights(self, factory: Factory[StaticTweezers]) -> None:
+        """The array stays as it is while it is on; amplitudes of tones and wrong weights are refused."""
+        with self.opened(factory) as (tweezers, context):
+            if tweezers.facts.control != "sites":
+                return
+            n_rows, n_cols = context.grid.shape
+            weights = np.linspace(1.0, 2.0, n_rows * n_cols).reshape(n_rows, n_cols)
+            before = weights.copy()
+            with doing("load_weights()"):
+                tweezers.start()
+                tweezers.load_weights(weights)
+            assert np.array_equal(before, weights), "load_weights() changed the caller's array"
+            wrong = {
+                "negative": -weights,
+                "of 0": np.zeros_like(weights),
+                "nan": np.full_like(weights, math.nan),
+            }
+            for what, each in {**wrong, "of another shape": weights[1:]}.items():
+                refusal(LimitError, f"load_weights() of weights that are {what}", tweezers.load_weights, each)
+
     @promise("load() takes None, or one amplitude for each row and column, and leaves them untouched")
     def test_loads_amplitudes(self, factory: Factory[StaticTweezers]) -> None:
-        """Calibrated ones, then given ones."""
+        """Calibrated ones, then given ones; LimitError where no tones can be set."""
         with self.opened(factory) as (tweezers, context):
             with doing("load(None)"):
                 tweezers.load(None)
             amplitudes = amplitudes_of(context.grid)
+            if tweezers.facts.control != "tones":
+                refusal(LimitError, "load((rows, columns))", tweezers.load, amplitudes)
+                return
             before = [values.copy() for values in amplitudes]
             with doing("load((rows, columns))"):
                 tweezers.load(amplitudes)
