@@ -2,7 +2,7 @@
 
     with Leader() as labseq:
         # load atoms here
-        labseq.go("run 17")
+        labseq.go("run 17", {"shot.hold.duration": "5 ms"})
         answer = labseq.wait()
         if answer.is_ready:
             print(answer.filling, answer.after)  # rows of booleans; an array if numpy is installed
@@ -20,7 +20,7 @@ import sys
 import time
 from collections import deque
 from pathlib import Path
-from typing import Any
+from typing import Any, Callable, Mapping
 
 try:
     import numpy as np
@@ -34,11 +34,35 @@ class LabseqError(Exception):
     """labseq refused what it was sent; the text is its reason."""
 
 
+class Image:
+    """An image of a shot.
+
+    Attributes:
+        name: Its name in the shot's file.
+        facts: All that labseq said about it; times in seconds after `go`.
+    """
+
+    def __init__(self, facts: dict[str, Any], shape: tuple[int, int]) -> None:
+        self.facts = facts
+        self.name: str = facts["name"]
+        self._shape = shape
+
+    @property
+    def occupancy(self) -> Any:
+        """Which sites hold an atom: a list of rows of booleans, or an array if numpy is installed."""
+        n_rows, n_cols = self._shape
+        packed = bytes.fromhex(self.facts["occupancy"])
+        bits = [byte >> k & 1 == 1 for byte in packed for k in range(7, -1, -1)]
+        rows = [bits[row * n_cols : (row + 1) * n_cols] for row in range(n_rows)]
+        return rows if np is None else np.array(rows, dtype=bool)
+
+
 class Answer:
     """How a shot ended.
 
     Attributes:
         is_ready: True if labseq finished its shot; False if it failed, and the atoms may be lost.
+        is_refused: True if labseq refused the values of `go`; it has not touched the atoms.
         reason: Why it failed; "" if it is ready.
         shot: Number of the shot in the run, from 0; None if no shot began.
         success: True if the last image met the target; None if no image was judged after the last moves.
@@ -51,6 +75,7 @@ class Answer:
     def __init__(self, facts: dict[str, Any]) -> None:
         self.facts = facts
         self.is_ready = facts["answer"] == "ready"
+        self.is_refused: bool = facts.get("refused", False)
         self.reason: str = facts.get("reason", "")
         self.shot: int | None = facts.get("shot")
         self.success: bool | None = facts.get("success")
@@ -89,10 +114,7 @@ class Answer:
             chosen = named[0]
         else:
             chosen = self.images[image]
-        n_rows, n_cols = self.facts["shape"]
-        bits = [byte >> k & 1 == 1 for byte in bytes.fromhex(chosen["occupancy"]) for k in range(7, -1, -1)]
-        rows = [bits[row * n_cols : (row + 1) * n_cols] for row in range(n_rows)]
-        return rows if np is None else np.array(rows, dtype=bool)
+        return Image(chosen, tuple(self.facts["shape"])).occupancy
 
     def __repr__(self) -> str:
         """The state, the shot, and what matters most."""
@@ -109,6 +131,8 @@ class Leader:
         token: Text of the file `leader.token`; by default it is read from labseq's state folder on this
             computer.
         timeout_s: Longest time for labseq to answer anything but the end of a shot, in seconds.
+        each_image: Have labseq tell each image as soon as it is known, for `on_image` of wait().
+        all_shots: Have labseq tell the end of shots that this connection did not start, too.
 
     Attributes:
         deadline_s: Longest time from `go` to the end of the shot, as the profile sets it.
@@ -120,17 +144,25 @@ class Leader:
     """
 
     def __init__(
-        self, host: str = "127.0.0.1", port: int = 5750, token: str | None = None, timeout_s: float = 5.0
+        self,
+        host: str = "127.0.0.1",
+        port: int = 5750,
+        token: str | None = None,
+        timeout_s: float = 5.0,
+        *,
+        each_image: bool = False,
+        all_shots: bool = False,
     ) -> None:
         token = own_token() if token is None else token
         self.timeout_s = timeout_s
         self._came = b""
         self._early: deque[dict[str, Any]] = deque()
-        self._is_due = False
+        self._is_due, self._all_shots = False, all_shots
         self._socket = socket.create_connection((host, port), timeout=timeout_s)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._send(f"hello {token} version={VERSION} form=json")
+            asked = " images=each" * each_image + " shots=all" * all_shots
+            self._send(f"hello {token} version={VERSION} form=json{asked}")
             hello = self._receive(("hello",), timeout_s)
         except BaseException:
             self._socket.close()
@@ -138,42 +170,83 @@ class Leader:
         self.deadline_s: float = hello["deadline_s"]
         self.shape: tuple[int, int] = tuple(hello["shape"])
 
-    def go(self, text: str = "") -> None:
+    def go(self, text: str = "", values: Mapping[str, Any] | None = None) -> None:
         """Start a shot; returns as soon as labseq has accepted it.
 
         Args:
-            text: Stored with the shot, at most 190 bytes on one line.
+            text: Stored with the shot.
+            values: Address -> value for this shot, as for `labseq run --set`: {"shot.hold.duration": "5 ms"}.
+                The sequence must allow the addresses in `leader: {may_set: [...]}`. labseq checks the values
+                when a step takes this `go`; it answers wait() with `is_refused` if one is wrong.
 
         Raises:
-            LabseqError: labseq still takes the last shot, or the text is too long.
+            LabseqError: labseq still takes the last shot, or text and values have more than 4,000 bytes.
             RuntimeError: wait() has not been called for the last `go`.
             OSError: The connection is lost.
         """
         if self._is_due:
             raise RuntimeError("call wait() for the last go first")
-        self._send(f"go {text}".strip())
+        self._send(json.dumps({"go": text, "values": dict(values or {})}))
         answer = self._receive(("busy", "failed"), self.timeout_s)
         if answer["answer"] == "failed":
             raise LabseqError(answer["reason"])
         self._is_due = True
 
-    def wait(self, timeout_s: float | None = None) -> Answer:
+    def set(self, values: Mapping[str, Any]) -> None:
+        """Give values for the next shot, which `go` or an edge at the timing box starts.
+
+        labseq answers while no shot goes on.
+
+        Args:
+            values: As for go().
+
+        Raises:
+            LabseqError: A value is refused; the text says why.
+            OSError: The connection is lost, or a shot goes on for longer than `timeout_s`.
+        """
+        self._send(json.dumps({"set": dict(values)}))
+        self._receive(("set",), self.timeout_s)
+
+    def wait(
+        self,
+        timeout_s: float | None = None,
+        on_image: Callable[[Image], Any] | None = None,
+        on_step: Callable[[str], Any] | None = None,
+        on_light: Callable[[float], Any] | None = None,
+    ) -> Answer:
         """Wait for the end of the shot.
 
         Args:
-            timeout_s: By default a second more than the deadline, after which labseq answers in any case.
+            timeout_s: Longest time between two messages of labseq; by default a second more than the
+                deadline, after which labseq answers in any case.
+            on_image: Called with each image, if the connection was made with `each_image`.
+            on_step: Called with the name of a step `leader: NAME`; does it, and returns when it is done.
+            on_light: Called with the exposure time in seconds: turns the imaging light on. Called with 0:
+                turns it off.
 
         Raises:
-            RuntimeError: No `go` waits for its answer.
+            RuntimeError: No `go` waits for its answer, or labseq asks for something that no function does.
             OSError: Nothing came in time (wait() may be called again), or the connection is lost. Treat the
                 atoms as not rearranged.
         """
-        if not self._is_due:
+        if not (self._is_due or self._all_shots):
             raise RuntimeError("call go() first")
         limit_s = self.deadline_s + 1.0 if timeout_s is None else timeout_s
-        answer = Answer(self._receive(("ready", "failed"), limit_s))
-        self._is_due = False
-        return answer
+        while True:
+            message = self._receive(("ready", "failed", "image", "your", "light", "dark"), limit_s)
+            word = message["answer"]
+            if word in ("ready", "failed"):
+                self._is_due = False
+                return Answer(message)
+            if word == "image":
+                if on_image is not None:
+                    on_image(Image(message, self.shape))
+            elif word == "your":
+                self._act(on_step, message["step"], "on_step")
+                self._send("done")
+            else:
+                self._act(on_light, message.get("exposure_s", 0.0), "on_light")
+                self._send("lit" if word == "light" else "dark")
 
     def abort(self) -> Answer:
         """End the shot before it next moves atoms, and wait for its end.
@@ -205,6 +278,12 @@ class Leader:
     def __exit__(self, *error: object) -> None:
         """Close it."""
         self.close()
+
+    @staticmethod
+    def _act(function: Callable[[Any], Any] | None, value: Any, name: str) -> None:
+        if function is None:
+            raise RuntimeError(f"labseq asks for {value!r}; give wait() a function '{name}'")
+        function(value)
 
     def _send(self, line: str) -> None:
         if "\n" in line or "\r" in line:

@@ -245,6 +245,7 @@ class ShotRecord:
         n_missing_atoms: Atoms that the loading fell short of the target.
         readings: Values read from devices during the shot.
         parameters: What differs from the files in this shot: address -> value, SI.
+        target: Its target; None for that of the run.
         calibrations: Those in use: kind -> id.
         atom_events: What a simulation reports about the atoms: name -> structured array.
         thresholds: float64 (n_rows, n_cols), there is an atom where the signal of an image exceeds them; None
@@ -271,6 +272,7 @@ class ShotRecord:
     n_missing_atoms: int = 0
     readings: dict[str, Any] = field(default_factory=dict[str, Any])
     parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    target: TargetPattern | None = None
     calibrations: Mapping[str, str] = field(default_factory=dict[str, str])
     atom_events: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
     thresholds: NDArray[np.float64] | None = None

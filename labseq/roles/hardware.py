@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
@@ -440,6 +440,49 @@ class LeaderLink(Protocol):
 
     def new_events(self) -> Sequence[str]:
         """Messages for the log since the last call: connections, and texts that were not understood."""
+        ...
+
+
+@runtime_checkable
+class LeaderDialogue(LeaderLink, Protocol):
+    """A link that carries more than edges: values for a shot, images, steps and light of the other system."""
+
+    @property
+    def asks_for_light(self) -> bool:
+        """Whether the other system turns the imaging light on when it is asked to."""
+        ...
+
+    def expect_values(self, check: Callable[[Mapping[str, str]], None]) -> None:
+        """From now on, check values that the other system sends in advance by this function, which raises."""
+        ...
+
+    def take_values(self) -> Mapping[str, str]:
+        """The values that it has sent for the shot that begins: address -> value as for ``--set``."""
+        ...
+
+    def take_turn(self, step: str, timeout_s: float, shot: int) -> str:
+        """Let the other system do a step of its own; returns the text with which it reports the end.
+
+        Raises:
+            DeviceError: It is not connected, or leaves.
+            DeviceTimeoutError: It does not report the end in time.
+        """
+        ...
+
+    def light_on(self, exposure_s: float, shot: int) -> None:
+        """Have it turn the imaging light on; returns once the light is on.
+
+        Raises:
+            DeviceError: As for a step.
+        """
+        ...
+
+    def light_off(self, shot: int) -> None:
+        """Have it turn the light off. Until it has, ``check_interlocks`` waits, and raises at last."""
+        ...
+
+    def report_image(self, about: Mapping[str, Any]) -> None:
+        """Tell an image if it has asked for that: "shot", "image" (``ImageRecord``), "target", "start_s"."""
         ...
 
 

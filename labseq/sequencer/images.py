@@ -98,22 +98,21 @@ class CameraSeries:
     through the EM register between exposures as well.
 
     Args:
-        timelines: The timeline of each step of the shot; without one, each image is armed for on its own.
         call: Calls the camera within the time limit of a call.
 
     Attributes:
+        timelines: The timeline of each step of the shot; without one, each image is armed for on its own.
         by_line: Whether a line of the timing box triggers the camera.
         cycle_s: Time from one exposure to the next if the camera starts them by itself, in seconds; else 0.
         fire_s: When the lines must be fired for such an exposure, on the session's clock; nan for none.
         arm_s: Time that arming takes, in seconds.
     """
 
-    def __init__(
-        self, lab: Lab, timelines: Sequence[Sequence[TimelineEntry]], call: Callable[..., Any]
-    ) -> None:
+    def __init__(self, lab: Lab, call: Callable[..., Any]) -> None:
         facts = lab.camera.facts
         self.by_line = trigger_line(lab.line_specs, "camera") is not None
-        self._camera, self._specs, self._call, self._timelines = lab.camera, lab.line_specs, call, timelines
+        self._camera, self._specs, self._call = lab.camera, lab.line_specs, call
+        self.timelines: Sequence[Sequence[TimelineEntry]] = ()
         self.arm_s = facts.arm_s
         self._has_gain = facts.em_gain > 1.0
         self._is_lit_between = self._has_gain and bool(blinding_lines(lab.line_specs, IDLE))
@@ -125,7 +124,7 @@ class CameraSeries:
 
     def entries(self, number: int) -> Sequence[TimelineEntry]:
         """The timeline of a step; empty if it is not known."""
-        return self._timelines[number] if number < len(self._timelines) else ()
+        return self.timelines[number] if number < len(self.timelines) else ()
 
     def begin_step(self, number: int) -> None:
         """Begin a step: disarm the camera if light of this step may harm it."""
@@ -165,8 +164,8 @@ class CameraSeries:
     def _alike(self, exposure_s: float) -> Iterator[int]:
         """Numbers of the images to come, as long as they are alike and no light may harm the camera."""
         n_before = self._n_taken
-        for number in range(self._step, len(self._timelines)):
-            for entry in self._timelines[number]:
+        for number in range(self._step, len(self.timelines)):
+            for entry in self.timelines[number]:
                 skipped = min(n_before, entry.n_images)
                 n_before -= skipped
                 if self._may_blind(entry) or (entry.n_images > skipped and entry.exposure_s != exposure_s):

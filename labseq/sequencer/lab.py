@@ -135,6 +135,8 @@ class Lab:
         return in_safe_order(dict(self.hardware()))
 
 
+Emit = Callable[[str, Mapping[str, Any]], None]
+"""Receives an event: name and values."""
 Outcome = dict[str, LabseqError | None]
 """Device name -> its failure, or None; in the order of the calls."""
 

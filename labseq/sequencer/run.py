@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from enum import Enum
 from functools import partial
 from types import MappingProxyType
@@ -19,9 +18,10 @@ from labseq.model import ShotRecord, TimelineEntry
 from labseq.model.policies import RunPolicy, StepPolicy, Then, may_be_retried
 from labseq.model.records import ShotStatus, unique_names
 from labseq.plain import now_utc
-from labseq.roles import RunObserver, Step
+from labseq.roles import RunObserver, Step, leaders
 from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import (
+    Emit,
     Lab,
     Outcome,
     close_all,
@@ -29,8 +29,7 @@ from labseq.sequencer.lab import (
     make_safe,
     open_device,
 )
-from labseq.sequencer.leader import Emit
-from labseq.sequencer.shot import Events, RunningShot, Stages
+from labseq.sequencer.shot import Events, RunningShot, ShotSettings, Stages
 from labseq.watchdog import Watchdog
 
 
@@ -179,6 +178,8 @@ class Sequencer:
         parameters: Settings that differ from the files, recorded with each shot: address -> value.
         watchdog: Switches the outputs off if this process dies or hangs; by default one without a log.
         place_of: Where the shot of an index will be recorded if it counts: "run" and "file".
+        settings_for: The settings of a shot with values of another control system, by address; raises
+            ConfigError for values that are wrong or not allowed. None allows none.
 
     Attributes:
         lab: The devices.
@@ -201,6 +202,7 @@ class Sequencer:
         parameters: Mapping[str, Any] | None = None,
         watchdog: Watchdog | None = None,
         place_of: Callable[[int], Mapping[str, str]] = lambda _: {},
+        settings_for: Callable[[Mapping[str, str]], ShotSettings] | None = None,
     ) -> None:
         self.lab = lab
         self._watchdog = watchdog or Watchdog()
@@ -212,6 +214,7 @@ class Sequencer:
         self._sink = sink
         self._seed = seed
         self._place_of = place_of
+        self._settings_for = settings_for
         self._policy = policy
         self._parameters = dict(parameters or {})
         self._states = StateTable(self._announce)
@@ -338,10 +341,15 @@ class Sequencer:
         """Make one attempt at a shot and write it; returns the reaction and the reason if it failed."""
         self._states.to(State.SHOT)
         self._warn_of_watchdog()
-        record = ShotRecord(index, attempt, self._seed, now_utc(), parameters=self._parameters)
+        record = ShotRecord(index, attempt, self._seed, now_utc())
         record.calibrations = {kind: entry.id for kind, entry in self.lab.calibrations.items()}
-        place = self._place_of(index)
-        shot = RunningShot(self.lab, self.guard, record, self._events, self._timelines, place)
+        settings = ShotSettings(self.lab, self._steps, self._timelines, self._parameters)
+        shot = RunningShot(settings, self.guard, record, self._events)
+        if any(leaders(dict(self.lab.hardware()))):
+            from labseq.sequencer.leader import LeaderAnswers  # most profiles have no leader
+
+            place = self._place_of(index)
+            shot.leaders = LeaderAnswers(shot, self.guard, self._events, place, self._settings_for)
         failure: LabseqError | None = None
         then: Then | None = None
         try:  # what ends the run; within it, what the run goes on after
@@ -353,7 +361,7 @@ class Sequencer:
                     raise
                 failure = error
                 self._recover()
-                replace(shot.leaders, emit=self._emit).failed(error)
+                self._tell_leaders(shot, error)
         except BaseException as error:  # KeyboardInterrupt too, where no signal handler could be set
             stopped = isinstance(error, StopRequested | KeyboardInterrupt)
             self._abort(shot, "interrupted" if stopped else "failed", error)
@@ -392,13 +400,15 @@ class Sequencer:
         shot.poll()
         shot.check_interlocks()
         images = unique_names([name for name, _ in self._steps])
-        for number, (name, step) in enumerate(self._steps):
+        for number in range(len(self._steps)):
             self._stop.check()
+            name, step = shot.steps[number]  # a leader may have set other values at a step before
             policy = self._policy.of_step(number)
             with shot.of_step(number, name, policy, images[number], needs_image=step.needs_image):
                 self._run_step(shot, number, name, step)
         shot.series.end()
-        shot.leaders.ready()  # before the shot is written, because atoms are lost while the disk writes
+        if shot.leaders is not None:
+            shot.leaders.ready()  # before the shot is written, because atoms are lost while the disk writes
         shot.record_truth()
 
     def _run_step(self, shot: RunningShot, number: int, name: str, step: Step) -> None:
@@ -433,7 +443,7 @@ class Sequencer:
         """Make the devices safe; only then answer the other control system and write the shot."""
         self._secure()
         with self._stop.held():  # a driver may have to wait for its device in order to answer
-            replace(shot.leaders, emit=self._emit).failed(error)
+            self._tell_leaders(shot, error)
         self._close_record(shot.record, status, error)
         try:
             row = self._sink.write_shot(shot.record)
@@ -442,6 +452,10 @@ class Sequencer:
             self._emit("warning", {"text": text})
         else:
             self._emit("shot_finished", {"shot": shot.record, "row": row})
+
+    def _tell_leaders(self, shot: RunningShot, error: BaseException) -> None:
+        if shot.leaders is not None:
+            shot.leaders.failed(error, self._emit)
 
     def _close_record(self, record: ShotRecord, status: ShotStatus, error: BaseException | None) -> None:
         record.status = status

@@ -9,8 +9,7 @@ import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
-from types import MappingProxyType
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, ParamSpec, TypeVar, cast
 
 import numpy as np
 
@@ -38,12 +37,14 @@ from labseq.model.lines import NO_PULSES, Pulses
 from labseq.model.policies import NO_POLICY, StepPolicy
 from labseq.model.records import OVERSHOOT_S, STEP, LineEdge
 from labseq.realtime import raise_priority, restore_priority
-from labseq.roles import Device, Hardware, ReportsSignals, RunObserver, StepContext, overrides
+from labseq.roles import Device, Hardware, ReportsSignals, RunObserver, Step, StepContext, overrides
 from labseq.sequencer.images import CameraSeries, as_frame, take_frame
-from labseq.sequencer.lab import Lab, check_blinding
-from labseq.sequencer.leader import Emit, LeaderAnswers
+from labseq.sequencer.lab import Emit, Lab, check_blinding
 from labseq.sequencer.lines import line_program, margin_s, trigger_line
 from labseq.units import format_quantity
+
+if TYPE_CHECKING:
+    from labseq.sequencer.leader import LeaderAnswers
 
 
 class Events:
@@ -195,40 +196,48 @@ PLAYED_EARLY_S = 10e-6
 """By how much a program may end early, beside the delay of the device, which may be shorter than it says."""
 
 
+class ShotSettings(NamedTuple):
+    """What a shot does, where it may differ from the shots before.
+
+    Attributes:
+        lab: The devices, with planner and target.
+        steps: Its steps, with their names.
+        timelines: The timeline of each step.
+        parameters: The settings that differ from the files: address -> value.
+    """
+
+    lab: Lab
+    steps: Sequence[tuple[str, Step]]
+    timelines: Sequence[Sequence[TimelineEntry]]
+    parameters: Mapping[str, Any]
+
+
 class RunningShot:
     """Implements ``labseq.roles.Shot`` for the steps and fills the shot's record.
 
     Args:
         record: Filled while the shot runs, so that nothing is lost if it fails.
-        place: Where it will be recorded, see :class:`LeaderAnswers`.
+
+    Attributes:
+        leaders: Speaks with other control systems; None without a device for one.
     """
 
-    def __init__(
-        self,
-        lab: Lab,
-        guard: Guard,
-        record: ShotRecord,
-        events: Events,
-        timelines: Sequence[Sequence[TimelineEntry]] = (),
-        place: Mapping[str, str] = MappingProxyType({}),
-    ) -> None:
-        self.lab = lab
+    leaders: LeaderAnswers | None = None
+
+    def __init__(self, settings: ShotSettings, guard: Guard, record: ShotRecord, events: Events) -> None:
+        lab = settings.lab
         self.record = record
         self.index = record.shot_index
         self.occupancy: Occupancy | None = None
         self.frame: Frame | None = None
         self.grid = lab.grid
         self.motion = lab.motion
-        self.target = lab.target
         self.clock = lab.clock
         self.simulation = lab.simulation
         self.static_tweezers = lab.static_tweezers
         self.mobile_tweezers = lab.mobile_tweezers
         self.detector = lab.detector
         self.calibrations = lab.calibrations
-        self.planner = lab.planner
-        self.planner_name = lab.planner_name
-        self.degree_of_parallelism = lab.degree_of_parallelism
         self.call_timeout_s = lab.timeouts.call_s
         self.plan_timeout_s = lab.timeouts.plan_s
         self.in_step = False
@@ -236,12 +245,23 @@ class RunningShot:
         self._kept: tuple[float, float] | None = None
         self.stages = Stages(lab, record, events)
         self.start_s = self.stages.start_s
-        self.leaders = LeaderAnswers(lab, guard, record, events, self.start_s, place)
-        self.series = CameraSeries(lab, timelines, partial(guard.call, "camera", lab.timeouts.call_s))
+        self.series = CameraSeries(lab, partial(guard.call, "camera", lab.timeouts.call_s))
         self._fired_s = self._started_s = 0.0
         self._frame_s: tuple[float, float] | None = None
         self._guard = guard
         self._events = events
+        self.use(settings)
+
+    def use(self, settings: ShotSettings) -> None:
+        """Do the rest of the shot with these settings."""
+        self.lab, self.steps = settings.lab, settings.steps
+        self.target = self.lab.target
+        self.planner = self.lab.planner
+        self.planner_name = self.lab.planner_name
+        self.degree_of_parallelism = self.lab.degree_of_parallelism
+        self.series.timelines = settings.timelines
+        self.record.parameters = settings.parameters
+        self.record.target = self.target
 
     @property
     def step(self) -> int:
@@ -354,7 +374,17 @@ class RunningShot:
 
     def follow(self, signal: str, timeout_s: float, device: str = "") -> None:
         """Wait for the start signal of another control system; see ``labseq.plugin.Shot``."""
-        self.leaders.follow(signal, timeout_s, device)
+        self._leaders.follow(signal, timeout_s, device)
+
+    def leave_to_leader(self, step: str, timeout_s: float, device: str = "") -> None:
+        """Let another control system do a step of its own; see ``labseq.plugin.Shot``."""
+        self._leaders.take_turn(step, timeout_s, device)
+
+    @property
+    def _leaders(self) -> LeaderAnswers:
+        if self.leaders is None:
+            raise ConfigError("the profile has no device through which another control system leads")
+        return self.leaders
 
     @property
     def step_context(self) -> StepContext:
@@ -482,6 +512,8 @@ class RunningShot:
         name = self._name_of_image(cycle)
         image = ImageRecord(frame, occupancy, confidence, self.step, cycle, start_s, exposure_s, name, signal)
         self.record.images.append(image)
+        if self.leaders is not None:
+            self.leaders.image(image)
         if cycle >= 0 and self.record.seen_defect_free_cycle < 0 and self.target.is_met_by(occupancy):
             self.record.seen_defect_free_cycle = cycle
         filling = math.nan if self.target.is_none else self.target.filling_fraction(occupancy)
@@ -507,7 +539,8 @@ class RunningShot:
             with self.stage("arm", self.series.arm_s, cycle):
                 self.series.arm(exposure_s)
         with self.stage("expose", exposure_s + readout_s + margin_s(specs, "image"), cycle):
-            with self.lines_on("image", exposure_s):
+            light = nullcontext() if self.leaders is None else self.leaders.light(exposure_s)
+            with light, self.lines_on("image", exposure_s):
                 if not self.series.by_line:
                     self.call("camera", limit_s, camera.trigger)
                 end_s, host_start_s = self.elapsed_s + exposure_s, time.perf_counter()

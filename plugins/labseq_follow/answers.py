@@ -16,7 +16,7 @@ from labseq.plugin.messages import visible
 VERSION: Final = 3
 """Version of the protocol."""
 SHORT_LINE: Final = 200
-"""Longest line in bytes that a control system sends, and of the short form."""
+"""Longest first line in bytes of a control system, and longest answer of the short form."""
 LONGEST_REASON: Final = 1000
 
 
@@ -29,8 +29,32 @@ class Form(Enum):
     JSON = "json"
 
 
-def form_of(words: str) -> Form:
-    """The form that the words after `hello`, and after the token, ask for.
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a control system asks for in its `hello`.
+
+    Attributes:
+        form: Form of the answers.
+        each_image: Whether it wants an answer for each image.
+        listens: Whether it wants the answers of shots that it did not start, too.
+    """
+
+    form: Form = Form.SHORT
+    each_image: bool = False
+    listens: bool = False
+
+
+CHOICES_OF_HELLO: Final = {
+    "version": (str(VERSION),),
+    "form": ("text", "json"),
+    "images": ("last", "each"),
+    "shots": ("own", "all"),
+}
+"""What a `hello` may ask for -> its values, the default first."""
+
+
+def asked_for(words: str) -> Asked:
+    """What the words after `hello`, and after the token, ask for.
 
     Raises:
         ValueError: Another version, or a word that is not known; says what was expected.
@@ -38,18 +62,22 @@ def form_of(words: str) -> Form:
     asked: dict[str, str] = {}
     for word in words.split():
         key, _, value = word.partition("=")
-        if key not in ("version", "form") or key in asked:
+        if key not in CHOICES_OF_HELLO or key in asked:
             what = f"'{one_line(word)[:40]}' in hello"
-            raise ValueError(f"{what}; expected version={VERSION} and form=text or form=json")
+            keys = "form=text, form=json, images=each or shots=all"
+            raise ValueError(f"{what}; expected version={VERSION} and {keys}")
         asked[key] = value
     if not asked:
-        return Form.SHORT
+        return Asked()
     if asked.get("version") != str(VERSION):
         came = one_line(asked.get("version", "missing"))[:10]
         raise ValueError(f"version is {came}; this labseq speaks version={VERSION}")
-    if (form := asked.get("form", "text")) not in ("text", "json"):
-        raise ValueError(f"form is {one_line(form)[:10]}; expected text or json")
-    return Form(form)
+    for key, value in asked.items():
+        if value not in CHOICES_OF_HELLO[key]:
+            expected = " or ".join(CHOICES_OF_HELLO[key])
+            raise ValueError(f"{key} is {one_line(value)[:10]}; expected {expected}")
+    form = Form(asked.get("form", "text"))
+    return Asked(form, asked.get("images") == "each", asked.get("shots") == "all")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +109,7 @@ def facts_of(about: Mapping[str, Any], times: Times) -> dict[str, Any]:
         since_s, target = about["start_s"] - times.go_s, about["target"]
         first_s = times.taken_s - about["start_s"]
         images = [image for image in record.images if image.t_start_s >= first_s]
-        facts["images"] = [_image(image, target, since_s) for image in images]
+        facts["images"] = [image_facts(image, target, since_s) for image in images]
         if images:
             facts["shape"] = list(images[-1].occupancy.shape)
             facts["atoms"], facts["defects"] = (facts["images"][-1][key] for key in ("atoms", "defects"))
@@ -97,11 +125,16 @@ def facts_of(about: Mapping[str, Any], times: Times) -> dict[str, Any]:
             for stage in record.timing
             if stage.t_start_s >= first_s
         ]
-    facts |= {key: about[key] for key in ("file", "run", "reason") if key in about}
+    facts |= {key: about[key] for key in ("refused", "file", "run", "reason") if key in about}
     return facts
 
 
-def _image(image: ImageRecord, target: TargetPattern, since_s: float) -> dict[str, Any]:
+def image_facts(image: ImageRecord, target: TargetPattern, since_s: float) -> dict[str, Any]:
+    """The facts of an image.
+
+    Args:
+        since_s: Time from `go` to the start of the shot, in seconds.
+    """
     return {
         "name": image.name,
         "step": image.step,
@@ -147,7 +180,7 @@ def line(form: Form, word: str, facts: Mapping[str, Any]) -> str:
 def _flat(facts: Mapping[str, Any]) -> dict[str, Any]:
     """The facts of a line of text: of the images, the first and the last, and which were judged."""
     flat = {key: value for key, value in facts.items() if not isinstance(value, list) and value is not None}
-    last = {key: flat.pop(key) for key in ("file", "run", "reason") if key in flat}
+    last = {key: flat.pop(key) for key in ("occupancy", "file", "run", "reason") if key in flat}
     if images := facts.get("images"):
         flat["judged"] = ",".join(str(int(image["judged"])) for image in images)
         flat |= {"before": images[0]["occupancy"], "after": images[-1]["occupancy"]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from labseq.plugin import (
@@ -12,6 +12,7 @@ from labseq.plugin import (
     Device,
     DeviceError,
     DeviceTimeoutError,
+    LabseqError,
     ShotAbortedError,
     format_quantity,
     wait_for,
@@ -40,10 +41,10 @@ def serial_leader(settings: SerialLeaderSettings, context: Context) -> LeaderDev
 
 
 class LeaderDevice(Device):
-    """Receives the start signal `go`, and answers with the result; implements ``labseq.plugin.LeaderLink``.
+    """Receives the start signal `go`, and answers with the result.
 
-    A thread receives, and keeps the deadline while a shot goes on. The device has no commands; its
-    values are ``state`` ("idle", "waiting", "busy") and ``is_connected``.
+    Implements ``labseq.plugin.LeaderDialogue``. A thread receives, and keeps the deadline while a shot goes
+    on. The device has no commands; its values are ``state`` ("idle", "waiting", "busy") and ``is_connected``.
 
     Args:
         settings: Deadline, and what a simulated lab does.
@@ -74,6 +75,13 @@ class LeaderDevice(Device):
         self._dialogue = Dialogue(self._settings.deadline, self._context.grid.shape)
         self._splitter = Splitter()
         self._failure: BaseException | None = None
+        self._check: Callable[[Mapping[str, str]], None] | None = None
+        self._is_in_shot = False
+
+    @property
+    def asks_for_light(self) -> bool:
+        """Whether the control system switches the imaging light when labseq asks for it."""
+        return self._settings.light == "asked"
 
     @property
     def deadline_s(self) -> float:
@@ -169,6 +177,57 @@ class LeaderDevice(Device):
         """
         if self._dialogue.is_aborted:
             raise ShotAbortedError("the leader aborted the shot", self._name)
+        if self._dialogue.awaited == "dark":
+            self._await_reply("its imaging light may be on", self._settings.light_timeout)
+
+    def expect_values(self, check: Callable[[Mapping[str, str]], None]) -> None:
+        """Check the values of `set` by this function; see ``labseq.plugin.LeaderDialogue``."""
+        self._check = check
+
+    def take_values(self) -> Mapping[str, str]:
+        """The values that were sent for the shot that begins; see ``labseq.plugin.LeaderDialogue``."""
+        with self._changed:
+            self._is_in_shot = True
+            return self._dialogue.take_values()
+
+    def take_turn(self, step: str, timeout_s: float, shot: int) -> str:
+        """Let the control system do a step of its own; see ``labseq.plugin.LeaderDialogue``.
+
+        Raises:
+            DeviceError: None is connected, or it left.
+            DeviceTimeoutError: It was not done in time.
+            ShotAbortedError: It aborted the shot.
+        """
+        self._request("your", {"step": step, "shot": shot, "timeout_s": timeout_s}, "done", timeout_s)
+        try:
+            self._await_reply(f"its step '{step}' is not done", timeout_s)
+        finally:
+            with self._changed:
+                self._dialogue.end_request(self._link.now())
+        return self._dialogue.reply
+
+    def light_on(self, exposure_s: float, shot: int) -> None:
+        """Have the control system turn the imaging light on; see ``labseq.plugin.LeaderDialogue``.
+
+        Raises:
+            DeviceError: None is connected, or it left.
+            DeviceTimeoutError: The light was not on in time.
+        """
+        limit_s = self._settings.light_timeout
+        if self._dialogue.awaited == "dark":
+            self._await_reply("its imaging light may be on from the last image", limit_s)
+        self._request("light", {"exposure_s": exposure_s, "shot": shot}, "lit", limit_s)
+        self._await_reply("its imaging light is not on", limit_s)
+
+    def light_off(self, shot: int) -> None:
+        """Have it turn the light off; ``check_interlocks`` waits until it has."""
+        self._request("dark", {"shot": shot}, "dark", self._settings.light_timeout)
+
+    def report_image(self, about: About) -> None:
+        """Tell an image, if the control system wants each."""
+        with self._changed:
+            if lines := self._dialogue.image(about):
+                self._send(lines)
 
     def report(self, state: str, about: About) -> str:
         """Answer a `go`; see ``labseq.plugin.LeaderLink``.
@@ -178,6 +237,7 @@ class LeaderDevice(Device):
         """
         self._check_open()
         with self._changed:
+            self._is_in_shot = False
             answered, lines = self._dialogue.report(state, about, self._link.now())
             is_sent = self._send(lines)
         return answered if is_sent or answered != state else "gone"
@@ -198,6 +258,7 @@ class LeaderDevice(Device):
             while not self._ending.is_set():
                 for event in self._link.poll():
                     self._handle(event)
+                self._check_set()
                 with self._changed:
                     self._send(self._dialogue.overdue(self._link.now()))
         except Exception as error:  # noqa: BLE001 - reported to the next step that waits
@@ -206,9 +267,9 @@ class LeaderDevice(Device):
     def _handle(self, event: Event) -> None:
         with self._changed:
             match event:
-                case "connected", who, form:
+                case "connected", who, asked:
                     self._splitter = Splitter()
-                    self._send(self._dialogue.connected(who, form))
+                    self._send(self._dialogue.connected(who, asked))
                 case "came", data:
                     self._receive(data)
                 case "lost", reason:
@@ -216,6 +277,7 @@ class LeaderDevice(Device):
                         text = f"the leader's last line, '{rest[:40]!a}', did not end, and was dropped"
                         self._dialogue.log.note(text)
                     self._dialogue.lost(reason)
+                    self._changed.notify_all()
                 case "note", text:
                     self._dialogue.log.note(text)
 
@@ -227,6 +289,47 @@ class LeaderDevice(Device):
             else:
                 self._send(self._dialogue.receive_line(line, self._link.now()))
         self._changed.notify_all()
+
+    def _check_set(self) -> None:
+        """Check the values of a `set`; not during a shot, which this would delay by milliseconds."""
+        values = self._dialogue.unchecked
+        if values is None or self._check is None or self._is_in_shot:
+            return
+        reason = ""
+        try:
+            self._check(values)
+        except LabseqError as error:
+            reason = str(error)
+        with self._changed:
+            if self._dialogue.unchecked is values:  # else a shot has begun with them meanwhile
+                self._send(self._dialogue.check_set(reason))
+
+    def _request(self, word: str, facts: About, reply: str, longest_s: float) -> None:
+        """Ask the control system for something that it replies to."""
+        self._check_open()
+        with self._changed:
+            if self._link.listens and not self._dialogue.is_connected:
+                raise DeviceError(self._name, f"no leader is connected that could answer '{word}'")
+            self._send(self._dialogue.request(word, facts, reply, self._link.now()))
+        if simulated := self._link.arrange_reply(reply, longest_s):
+            self._handle(("came", simulated))
+
+    def _await_reply(self, otherwise: str, timeout_s: float) -> None:
+        """Wait for the reply that was asked for."""
+        if wait_for(self._replied, timeout_s, self._context.clock) is None:
+            text = f"{otherwise}: the leader has not answered within {format_quantity(timeout_s, 'time')}"
+            raise DeviceTimeoutError(self._name, text, timeout_s)
+
+    def _replied(self, longest_s: float) -> bool | None:
+        with self._changed:
+            if not self._dialogue.awaited:
+                return True
+            if self._dialogue.is_aborted:
+                raise ShotAbortedError("the leader aborted the shot", self._name)
+            if self._link.listens and not self._dialogue.is_connected:
+                raise DeviceError(self._name, "the leader left before it answered")
+            self._changed.wait(longest_s)
+            return None
 
     def _take(self, longest_s: float) -> str | None:
         with self._changed:

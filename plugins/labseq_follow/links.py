@@ -11,7 +11,7 @@ from typing import Final, Literal, TypeAlias
 from labseq.plugin import Context, DeviceError
 from labseq.plugin.leader import GO, LeaderSettings, load_until_go
 from labseq.plugin.serial import BROKEN, Port, open_port
-from labseq_follow.answers import Form
+from labseq_follow.answers import Asked
 from labseq_follow.protocol import encoded
 from labseq_follow.settings import SerialLeaderSettings
 
@@ -23,12 +23,12 @@ REOPEN_S: Final = 0.5
 """Time between two attempts to open a port that was unplugged."""
 
 Event: TypeAlias = (
-    tuple[Literal["connected"], str, Form]
+    tuple[Literal["connected"], str, Asked]
     | tuple[Literal["came"], bytes]
     | tuple[Literal["lost"], str]
     | tuple[Literal["note"], str]
 )
-"""Who connected, and the form that it asks for; bytes; why the connection was lost; a note for the log."""
+"""Who connected, and what it asks for; bytes; why the connection was lost; a note for the log."""
 
 
 class Link:
@@ -58,6 +58,11 @@ class Link:
             DeviceTimeoutError: `go` will not come in time.
         """
         del timeout_s
+        return b""
+
+    def arrange_reply(self, reply: str, timeout_s: float) -> bytes:
+        """Called when labseq has asked for a reply; returns bytes that come as a consequence."""
+        del reply, timeout_s
         return b""
 
     def poll(self) -> list[Event]:
@@ -99,6 +104,12 @@ class SimulatedLink(Link):
         self._n_sent += 1
         return encoded(f"{GO} {self._n_sent}")
 
+    def arrange_reply(self, reply: str, timeout_s: float) -> bytes:
+        """Take the time of a step, and say that it is done; the light is there at once."""
+        if reply == "done":
+            self._context.clock.sleep(min(self._delay_s, timeout_s))
+        return encoded(reply)
+
 
 class SerialLink(Link):
     """A serial port that is opened exclusively, and opened again if it was unplugged."""
@@ -124,7 +135,7 @@ class SerialLink(Link):
         events: list[Event] = []
         if not self._is_reported:
             self._is_reported = True
-            events.append(("connected", f"the control system on {self.address}", Form.SHORT))
+            events.append(("connected", f"the control system on {self.address}", Asked()))
         try:
             data = self._port.read(max(1, self._port.in_waiting))
         except (*BROKEN, TypeError) as error:  # pyserial reads None from a port that was closed

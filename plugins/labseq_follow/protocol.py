@@ -8,17 +8,30 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from labseq.plugin.leader import GO, LeaderLog
+from labseq.plugin.leader import LeaderLog
 from labseq.plugin.messages import clean, visible
-from labseq_follow.answers import SHORT_LINE, VERSION, Form, Times, facts_of, form_of, line, one_line
-from labseq_follow.relay import ANSWERED
+from labseq_follow.answers import (
+    VERSION,
+    Asked,
+    Form,
+    Times,
+    asked_for,
+    facts_of,
+    image_facts,
+    line,
+    one_line,
+)
+from labseq_follow.relay import ANSWERED, LONGEST
+from labseq_follow.requests import Request, read_request
 
-MAX_LINE: Final = SHORT_LINE
-"""Longest line in bytes that a control system sends; more is noise."""
 MARKED: Final = re.compile(rf"{ANSWERED.decode()}(\d+\.\d+){ANSWERED.decode()}", re.ASCII)
 """What precedes a `go` that was answered, and the time at which it came."""
 NOT_ANSWERED: Final = "error"
 """Lines that begin so are never answered, or two programs could exchange errors forever."""
+
+EXPECTED: Final = "expected go, set, abort, state? or hello"
+REPLIES: Final = ("done", "lit", "dark")
+"""What a control system replies to labseq's requests."""
 
 About = Mapping[str, Any]
 
@@ -27,10 +40,10 @@ About = Mapping[str, Any]
 class _Go:
     """A `go` whose shot is not over."""
 
-    text: str
+    request: Request
     came_s: float
     due_s: float
-    """When it must be answered."""
+    """When it must be answered; infinite while labseq waits for a step of the control system."""
     taken_s: float = math.nan
     """When a step took it; nan if none has."""
     is_aborted: bool = False
@@ -56,6 +69,10 @@ class Dialogue:
     Attributes:
         is_waiting: Whether a step waits for `go`.
         is_connected: Whether a control system is connected.
+        asked: What the control system asked for when it connected.
+        unchecked: The values of a `set` that nobody has checked yet; None if there are none.
+        awaited: The reply that labseq waits for; "" for none.
+        reply: Text of the last reply.
         log: What happened.
     """
 
@@ -65,8 +82,12 @@ class Dialogue:
         self.log = LeaderLog()
         self._deadline_s = deadline_s
         self._shape = shape
-        self._form = Form.SHORT
+        self.asked = Asked()
+        self.unchecked: Mapping[str, str] | None = None
+        self.awaited = self.reply = ""
+        self._set: Mapping[str, str] = {}
         self._go: _Go | None = None
+        self._left_s = 0.0
 
     @property
     def state(self) -> str:
@@ -80,15 +101,15 @@ class Dialogue:
         """Whether the shot that goes on is to end."""
         return self._go is not None and self._go.is_aborted
 
-    def connected(self, who: str, form: Form = Form.SHORT) -> list[str]:
-        """A control system has connected, and asks for answers of this form."""
-        self.is_connected, self._form = True, form
+    def connected(self, who: str, asked: Asked = Asked()) -> list[str]:  # noqa: B008 - frozen
+        """A control system has connected."""
+        self.is_connected, self.asked, self.awaited = True, asked, ""
         self.log.note(f"{who} leads")
         return [self._hello()]
 
     def lost(self, reason: str) -> None:
         """The control system is gone: a `go` for which no step waited is dropped; a shot goes on."""
-        self.is_connected = False
+        self.is_connected, self.unchecked, self._set = False, None, {}
         self.log.note(f"the leader is gone: {reason}")
         if self._go is not None and not self._go.taken:
             self._go = None
@@ -99,21 +120,24 @@ class Dialogue:
     def receive_line(self, received: str, now_s: float) -> list[str]:
         """Handle a line that came; a `go` after the mark of :mod:`labseq_follow.relay` was answered."""
         answered = MARKED.match(received)
-        word, _, text = received[answered.end() if answered else 0 :].strip().partition(" ")
-        if word == GO:
-            came_s = min(now_s, float(answered[1])) if answered else now_s
-            return self._receive_go(text.strip(), came_s, is_answered=answered is not None)
-        if word == "abort" and not text:
-            return self._abort()
-        if word == "state?" and not text:
-            return [self._line("state", self.state)]
-        if word == "hello":
-            return self._receive_hello(text)
-        if word:
-            self.log.note(f"the leader sent '{clean(received.strip())}'")
-        if not word or word == NOT_ANSWERED:
-            return []
-        return [self.error(f"what is '{one_line(received)[:40]}'? expected go, abort, state? or hello")]
+        sent = received[answered.end() if answered else 0 :].strip()
+        request = read_request(sent, with_values=self.asked.form is not Form.SHORT)
+        match request.word:
+            case "go":
+                came_s = min(now_s, float(answered[1])) if answered else now_s
+                return self._receive_go(request, came_s, is_answered=answered is not None)
+            case "set":
+                return self._receive_set(request)
+            case "hello":
+                return self._receive_hello(request.text)
+            case "abort" if not request.text:
+                return self._abort()
+            case "state?" if not request.text:
+                return [self._line("state", self.state)]
+            case word if word in REPLIES:
+                return self._receive_reply(request)
+            case word:
+                return self._receive_other(sent, word)
 
     @property
     def next_answer(self) -> str:
@@ -129,18 +153,61 @@ class Dialogue:
         if self._go is None or self._go.taken or now_s >= self._go.due_s:
             return None
         self._go.taken_s = now_s
-        return self._go.text
+        return visible(self._go.request.text)
+
+    def take_values(self) -> Mapping[str, str]:
+        """The values for the shot that begins: those of `set`, then those of the `go` that was taken."""
+        sent = {**self._set, **(self.unchecked or {})}
+        self._set, self.unchecked = {}, None
+        return sent if self._go is None else {**sent, **self._go.request.values}
+
+    def check_set(self, reason: str) -> list[str]:
+        """Answer a `set` whose values have been checked; ``reason`` is why they are refused, or ""."""
+        values, self.unchecked = self.unchecked, None
+        if reason:
+            return [self.error(reason)]
+        self._set = values or {}
+        return [self._line("set")]
+
+    def request(self, word: str, facts: About, reply: str, now_s: float) -> list[str]:
+        """Ask the control system for something; its own time does not count towards the deadline."""
+        self.awaited, self.reply = reply, ""
+        if self._go is not None and reply == "done":
+            self._left_s, self._go.due_s = self._go.due_s - now_s, math.inf
+        return [line(self.asked.form, word, facts)]
+
+    def end_request(self, now_s: float) -> None:
+        """The reply has come, or nobody waits for it any longer."""
+        self.awaited = ""
+        if self._go is not None and self._go.due_s == math.inf:
+            self._go.due_s = now_s + self._left_s
+
+    def image(self, about: About) -> list[str]:
+        """Tell an image as soon as it is known, if the control system has asked for that."""
+        go, start_s = self._go, about["start_s"]
+        if not self.asked.each_image or (go.answered if go else not self.asked.listens):
+            return []
+        since_s = 0.0 if go is None else start_s - go.came_s
+        facts = image_facts(about["image"], about["target"], since_s)
+        return [line(self.asked.form, "image", {"shot": about["shot"], **facts})]
 
     def report(self, state: str, about: About, now_s: float) -> tuple[str, list[str]]:
         """The shot of a `go` is over: the answer (``labseq.plugin.LeaderLink.report``) and lines to send."""
         if self._go is None or not self._go.taken:
-            return "", []
+            return "", self._tell(state, about, now_s)
         late = self.overdue(now_s)
         go, self._go = self._go, None
         if go.answered:
             return go.answered, late
         facts = facts_of(about, Times(go.came_s, go.taken_s, now_s))
-        return state, [line(self._form, state, facts)]
+        return state, [line(self.asked.form, state, facts)]
+
+    def _tell(self, state: str, about: About, now_s: float) -> list[str]:
+        """Tell the end of a shot that no `go` began, if the control system has asked for that."""
+        if not (self.asked.listens and self.is_connected and "start_s" in about):
+            return []
+        start_s = about["start_s"]
+        return [line(self.asked.form, state, facts_of(about, Times(start_s, start_s, now_s)))]
 
     def overdue(self, now_s: float) -> list[str]:
         """Answer a `go` whose deadline has passed."""
@@ -160,12 +227,36 @@ class Dialogue:
         go, self._go = self._go, None
         return [] if go is None or go.answered else [self._failed("labseq ends")]
 
-    def _receive_go(self, text: str, came_s: float, *, is_answered: bool) -> list[str]:
+    def _receive_go(self, request: Request, came_s: float, *, is_answered: bool) -> list[str]:
         if self._go is not None:
             self.log.note_refused()
             return [self._failed("busy")]
-        self._go = _Go(visible(text), came_s, came_s + self._deadline_s)
-        return [] if is_answered else [self._line("busy")]
+        busy = [] if is_answered else [self._line("busy")]
+        if request.problem:
+            return [*busy, line(self.asked.form, "failed", {"refused": True, "reason": request.problem})]
+        self._go = _Go(request, came_s, came_s + self._deadline_s)
+        return busy
+
+    def _receive_set(self, request: Request) -> list[str]:
+        if request.problem or not request.values or request.text:
+            return [self.error(request.problem or "'set' needs values such as shot.hold.duration=\"5 ms\"")]
+        if self.unchecked is not None:
+            return [self.error("the last 'set' has not been answered yet")]
+        self.unchecked = {**self._set, **request.values}
+        return []
+
+    def _receive_reply(self, request: Request) -> list[str]:
+        if request.word != self.awaited:
+            return [self.error(f"'{request.word}' answers nothing that labseq has asked for")]
+        self.awaited, self.reply = "", visible(request.text)
+        return []
+
+    def _receive_other(self, sent: str, word: str) -> list[str]:
+        if word:
+            self.log.note(f"the leader sent '{clean(sent)}'")
+        if not word or word == NOT_ANSWERED:
+            return []
+        return [self.error(f"what is '{one_line(sent)[:40]}'? {EXPECTED}")]
 
     def _abort(self) -> list[str]:
         """End the shot: at once if no step has taken its `go`, otherwise before it next moves atoms."""
@@ -181,27 +272,27 @@ class Dialogue:
     def _receive_hello(self, words: str) -> list[str]:
         first, _, others = words.partition(" ")
         try:
-            self._form = form_of(words if "=" in first else others)  # the token has done its work
+            self.asked = asked_for(words if "=" in first else others)  # the token has done its work
         except ValueError as error:
             return [self.error(str(error))]
         return [self._hello()]
 
     def _failed(self, reason: str) -> str:
-        return line(self._form, "failed", {"reason": reason})
+        return line(self.asked.form, "failed", {"reason": reason})
 
     def _line(self, word: str, text: str = "") -> str:
         """A line without facts: "state busy"; in JSON its text has a key."""
-        if self._form is Form.JSON:
+        if self.asked.form is Form.JSON:
             key = "state" if word == "state" else "reason"
-            return line(self._form, word, {key: text} if text else {})
+            return line(self.asked.form, word, {key: text} if text else {})
         return f"{word} {text}".strip()
 
     def _hello(self) -> str:
         n_rows, n_cols = self._shape
-        if self._form is Form.JSON:
+        if self.asked.form is Form.JSON:
             facts = {"protocol": VERSION, "deadline_s": self._deadline_s, "shape": [n_rows, n_cols]}
-            return line(self._form, "hello", facts)
-        shape = f" rows={n_rows} cols={n_cols}" if self._form is Form.TEXT else ""
+            return line(self.asked.form, "hello", facts)
+        shape = f" rows={n_rows} cols={n_cols}" if self.asked.form is Form.TEXT else ""
         return f"hello labseq {VERSION} deadline={self._deadline_s:g}{shape}"
 
 
@@ -214,8 +305,8 @@ class Splitter:
     def feed(self, came: bytes) -> list[str | None]:
         """The lines that are complete; None for each that was too long."""
         *lines, begun = (self._begun + came).split(b"\n")
-        self._begun = begun[: MAX_LINE + 1]  # enough to see that it is too long
-        return [_decoded(part) if len(part) <= MAX_LINE else None for part in lines]
+        self._begun = begun[: LONGEST + 1]  # enough to see that it is too long
+        return [_decoded(part) if len(part) <= LONGEST else None for part in lines]
 
     def rest(self) -> str:
         """The part of a line that has not ended; it is dropped."""

@@ -8,6 +8,7 @@ answers `go` with a line that the run has given it in advance. It imports the st
 from __future__ import annotations
 
 import os
+import re
 import select
 import signal
 import socket
@@ -19,8 +20,10 @@ from typing import Final
 
 ANSWERED: Final = b"\x06"
 """Stands around the time at which a `go` came that was answered; taken out of what a control system sends."""
-LONGEST: Final = 200
+LONGEST: Final = 4000
 """More than this without a line feed is passed on as it is; the run says that the line is too long."""
+GO: Final = re.compile(rb'\s*(go(\s|$)|\{\s*"go")')
+"""The beginning of a `go`, as words or as a JSON object."""
 EXIT_S: Final = 2.0
 
 
@@ -103,7 +106,7 @@ def _relay(run: socket.socket, leader: socket.socket) -> None:
         *lines, begun = (begun + came.replace(ANSWERED, b"?")).split(b"\n")
         for line in lines:
             mark = b""
-            if answer and line.split(b" ")[0].strip() == b"go" and len(line) <= LONGEST:
+            if answer and GO.match(line) and len(line) <= LONGEST:
                 with suppress(OSError):
                     leader.send(answer + b"\n")
                 # the run may read it much later; a monotonic time is the same in all processes

@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from labseq.plugin import setting_error, wire
+from labseq.plugin import PositiveDuration, setting_error, wire
 from labseq.plugin.leader import LeaderSettings
 from labseq.plugin.messages import clean
 from labseq.plugin.serial import port_identities
@@ -24,6 +24,14 @@ class LinkSettings(LeaderSettings):
         default=False,
         description="with a real control system and a simulated lab: atoms load at `go`, unless there "
         "are some",
+    )
+    light: Literal["own", "asked"] = Field(
+        default="own",
+        description="asked: labseq asks the control system for the imaging light at each image; own: it "
+        "does not ask",
+    )
+    light_timeout: PositiveDuration = Field(
+        default=1.0, description="longest time for the control system to turn the imaging light on or off"
     )
 
 

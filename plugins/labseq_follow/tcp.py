@@ -19,9 +19,9 @@ from typing import Any, Final
 from labseq.plugin import DeviceError, format_quantity
 from labseq.plugin.messages import clean
 from labseq.plugin.system import state_root
-from labseq_follow.answers import Form, form_of
+from labseq_follow.answers import SHORT_LINE, Asked, asked_for
 from labseq_follow.links import SLICE_S, Event, Link
-from labseq_follow.protocol import MAX_LINE, encoded
+from labseq_follow.protocol import encoded
 from labseq_follow.relay import Relay, can_relay
 from labseq_follow.settings import TcpLeaderSettings
 
@@ -148,28 +148,28 @@ class TcpLink(Link):
     def _receive_first_line(self, peer: socket.socket) -> list[Event]:
         newcomer = self._newcomers[peer]
         try:
-            data = peer.recv(MAX_LINE + 1)
+            data = peer.recv(SHORT_LINE + 1)
         except BlockingIOError:
             return []
         except OSError:
             data = b""
         newcomer.came += data
         line, ended, rest = newcomer.came.partition(b"\n")
-        if data and not ended and len(line) <= MAX_LINE:
+        if data and not ended and len(line) <= SHORT_LINE:
             return []
         begin = b"hello " + self._token
         words = line.strip()[len(begin) :]
         if not hmac.compare_digest(line.strip()[: len(begin)], begin) or words.strip() == words != b"":
             return self._refuse(peer, f"its first line is {clean(repr(line)[1:])}", NO_TOKEN)
         try:
-            form = form_of(words.decode("ascii", "backslashreplace"))
+            asked = asked_for(words.decode("ascii", "backslashreplace"))
         except ValueError as error:
             return self._refuse(peer, str(error), encoded(f"error {error}"))
         if self._leader is not None:
             return self._refuse(peer, "another one is in control", TAKEN)
-        return self._welcome(peer, form, rest)
+        return self._welcome(peer, asked, rest)
 
-    def _welcome(self, peer: socket.socket, form: Form, rest: bytes) -> list[Event]:
+    def _welcome(self, peer: socket.socket, asked: Asked, rest: bytes) -> list[Event]:
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in KEEPALIVE:
@@ -181,7 +181,7 @@ class TcpLink(Link):
             self._selector.unregister(peer)
             self._relay.serve(peer)
             self._selector.register(self._relay.received, selectors.EVENT_READ)
-        return [("connected", who, form), *([("came", rest)] if rest else [])]
+        return [("connected", who, asked), *([("came", rest)] if rest else [])]
 
     def _refuse(self, peer: socket.socket, why: str, answer: bytes = b"") -> list[Event]:
         """Close the connection of a newcomer; a flood of them must not fill the log."""
@@ -271,7 +271,7 @@ def _read_token(path: Path | None, device: str) -> bytes:
         if not stat.S_ISREG(mode):  # reading a pipe could block for ever
             raise OSError("it is not an ordinary file")
         with path.open("rb") as file:
-            token = file.read(MAX_LINE).strip()
+            token = file.read(SHORT_LINE).strip()
     except OSError as error:
         text = f"the token in {path} cannot be read: {error.strerror or error}"
         raise DeviceError(device, f"{text}; write 16 to 100 letters or digits to it") from error

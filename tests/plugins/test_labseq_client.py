@@ -122,7 +122,7 @@ def test_it_raises_with_the_reason_of_labseq() -> None:
             Leader(port=int(address.rpartition(":")[2]), token="0" * 32)
         assert first.state() == "idle"
         with pytest.raises(LabseqError, match="the line is too long"):
-            first.go("x" * 300)
+            first.go("x" * 4000)
         with pytest.raises(RuntimeError, match="call go"):
             first.wait()
         with pytest.raises(ValueError, match="line feed"):

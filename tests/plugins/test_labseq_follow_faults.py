@@ -31,8 +31,8 @@ def log(device: LeaderDevice) -> str:
 @pytest.mark.parametrize(
     ("noise", "answer"),
     [
-        (b"Go!\n", "error what is 'Go!'? expected go, abort, state? or hello"),
-        (b"\xff\x00\x80\n", r"error what is '\xff\x00\x80'? expected go, abort, state? or hello"),
+        (b"Go!\n", "error what is 'Go!'? expected go, set, abort, state? or hello"),
+        (b"\xff\x00\x80\n", r"error what is '\xff\x00\x80'? expected go, set, abort, state? or hello"),
         (b"x" * 10_000 + b"\n", "error the line is too long"),
     ],
     ids=["words", "bytes", "very long"],
@@ -119,7 +119,10 @@ def test_without_the_token_nothing_starts(sent: str, quoted: str) -> None:
         ("version=2", "version is 2; this labseq speaks version=3"),
         ("form=json", "version is missing; this labseq speaks version=3"),
         ("version=3 form=xml", "form is xml; expected text or json"),
-        ("version=3 colour=red", "'colour=red' in hello; expected version=3 and form=text or form=json"),
+        (
+            "version=3 colour=red",
+            "'colour=red' in hello; expected version=3 and form=text, form=json, images=each or shots=all",
+        ),
     ],
 )
 def test_a_hello_that_asks_for_what_is_not_spoken_is_refused_with_the_reason(words: str, reason: str) -> None:

@@ -13,7 +13,8 @@ from labseq.errors import StopRequested
 from labseq.guard import Guard
 from labseq.model import ShotRecord, TimelineEntry
 from labseq.roles import Step, StepContext
-from labseq.sequencer.shot import Events, RunningShot
+from labseq.sequencer.leader import LeaderAnswers
+from labseq.sequencer.shot import Events, RunningShot, ShotSettings
 from labseq.testing.contracts.promises import (
     ContractViolation,
     calls_of_sleep,
@@ -146,7 +147,8 @@ class StepContract:
         lab.static_tweezers.start()
         guard = Guard(lab.stop)
         events = Events(RecordingObserver(), guard)
-        shot = RunningShot(lab, guard, ShotRecord(0, 0, 0, ""), events)
+        shot = RunningShot(ShotSettings(lab, (), (), {}), guard, ShotRecord(0, 0, 0, ""), events)
+        shot.leaders = LeaderAnswers(shot, guard, events, {}, None)
         try:
             shot.take_image(0.045)
             yield shot, lab
