@@ -113,6 +113,11 @@ Examples:
   labseq first-contact mylab mobile_tweezers --with scope --step overwrite
   labseq first-contact bench_awg --yes
 """
+LEADER_EXAMPLES: Final = """\b
+Examples:
+  labseq leader-test
+  labseq leader-test 192.168.1.20 --token leader.token --shots 100
+"""
 DOCTOR_EXAMPLES: Final = """\b
 Examples:
   labseq doctor --dry-run
@@ -639,3 +644,37 @@ def first_contact(
 
     wanted, kind = Wanted(role, steps or (), output or data_root()), dry_run_mode(dry_run)
     raise typer.Exit(meet(profile, wanted, overrides or (), kind, instruments=instruments or (), yes=yes))
+
+
+@app.command(epilog=LEADER_EXAMPLES, short_help="Test a run that another control system leads.")
+def leader_test(
+    host: Annotated[
+        str, typer.Argument(metavar="HOST", help="Computer on which the run waits for `go`.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(metavar="N", min=1, max=65535, help="The `port` of its device tcp_leader.")
+    ] = 5750,
+    token: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Copy of leader.token from that computer; default: the one in this computer's state folder.",
+        ),
+    ] = None,
+    shots: Annotated[
+        int | None,
+        whole_number_option("Also take N shots of the run, at least 3. They move atoms, and they count."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Lead a run in place of the control system, rightly and wrongly, and measure how fast it answers.
+
+    It tries wrong tokens, rubbish, lines that are too long, slow and closed connections and two leaders, and
+    prints a histogram of the times to an answer. Without --shots it takes no shot. The control system must
+    not be connected meanwhile.
+    """
+    from labseq.cli.leader_test import MIN_SHOTS, play_leader
+
+    if shots is not None and shots < MIN_SHOTS:
+        raise typer.BadParameter(f"{shots} is too few; expected {MIN_SHOTS} or more", param_hint="--shots")
+    raise typer.Exit(play_leader(host, port, token, shots or 0, as_json=as_json))
