@@ -17,8 +17,8 @@ from labseq.messages import error_text
 from labseq.model import Frame, ImageRecord, ShotRecord, StageTiming, StepTiming, TargetPattern
 from labseq.model.records import LineEdge
 from labseq.recording import schema
+from labseq.recording.check_hdf5 import check_file
 from labseq.recording.read_hdf5 import (
-    check_contents,
     load_filter,
     read_attribute,
     read_fields,
@@ -140,7 +140,7 @@ def opened(path: Path, only: str = "") -> Generator[Any]:
         if read_attribute(file, "format") != schema.FORMAT:
             raise RecordingError(path, "is not a shot's file of labseq")
         check_version(path, str(read_attribute(file, "format_version")), schema.FORMAT_VERSION)
-        check_contents(file, path.stat().st_size, only)
+        check_file(file, path, only)
         yield cast("Any", file["entry"])
 
 
