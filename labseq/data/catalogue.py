@@ -189,7 +189,7 @@ def _connected(root: Path) -> sqlite3.Connection | None:
         connection = sqlite3.connect(file, isolation_level=None)
         try:
             connection.execute("pragma synchronous = off")  # after a power cut the runs are read again
-            connection.execute(f"create table if not exists runs_2 ({columns})")
+            connection.execute(f"create table if not exists runs_3 ({columns})")
             return connection
         except sqlite3.DatabaseError as error:
             connection.close()
@@ -202,7 +202,7 @@ def _kept(connection: sqlite3.Connection | None, day: str) -> dict[str, Kept]:
     """What is kept of the runs of a day, by day and name."""
     with suppress(sqlite3.Error):
         if connection is not None:
-            of_day = "select * from runs_2 where name >= ? and name < ?"  # "0" is the character after "/"
+            of_day = "select * from runs_3 where name >= ? and name < ?"  # "0" is the character after "/"
             rows = connection.execute(of_day, (f"{day}/", f"{day}0")).fetchall()
             return {name: Kept(*columns) for name, *columns in rows}
     return {}
@@ -216,5 +216,5 @@ def _keep(connection: sqlite3.Connection | None, new: Mapping[str, Kept]) -> Non
         if new:
             connection.execute("begin")
             rows = [(name, *kept) for name, kept in new.items()]
-            connection.executemany("insert or replace into runs_2 values (?, ?, ?, ?)", rows)
+            connection.executemany("insert or replace into runs_3 values (?, ?, ?, ?)", rows)
             connection.execute("commit")

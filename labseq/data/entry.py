@@ -102,8 +102,9 @@ class RunEntry:
             self.error,
             self.note,
         )
+        kind = ["simulated"] if self.simulated else []
         results = map(str, self.results)
-        return " ".join([*words, *self.tags, *self.scanned, *settings, *results]).lower()
+        return " ".join([*words, *kind, *self.tags, *self.scanned, *settings, *results]).lower()
 
     def open(self) -> Run:
         """Open the run.

@@ -110,7 +110,11 @@ class Api:
         return StreamingResponse(states, media_type="text/event-stream", headers=headers)
 
     def runs(self, request: Request) -> Any:
-        """The runs, the newest first."""
+        """The runs, the newest first.
+
+        A search answers within a few seconds. Runs that it has not read by then are counted as `n_unread`:
+        ask again.
+        """
         query = request.query_params
         first, most = _number(query, "first", 0), min(MAX_LISTED, _number(query, "n", 50))
         return self._runs.search(query.get("q", "")[:200], query.get("status", "")[:20], first, most)

@@ -31,7 +31,7 @@ _DESCRIPTIONS: Final = {
     "attempt": "an attempt that does not count; by default the one that counts",
     "quantity": "what to show at the points of the scan: survival:before,after@target; by default what the "
     "run measures",
-    "q": "words that date, name, profile, outcome, comment or tags must contain",
+    "q": "words that date, name, profile, settings, results, comment or tags must contain",
     "status": "running, complete, stopped, failed or damaged",
     "first": "number of rows to leave out",
     "n": "maximum number of rows",

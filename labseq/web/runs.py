@@ -6,7 +6,7 @@ import math
 import re
 import time
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -32,8 +32,11 @@ from labseq.web.history import RunHistory, judged_values
 
 MAX_TEXT: Final = 2000
 """Maximum number of characters of a text from a file that is passed on."""
+SEARCH_S: Final = 4.0
+"""Longest time of a search, in seconds. What it has read of runs is kept, so the next one gets further."""
+_MAX_SUMMARIES: Final = 2000
 _LISTED_S: Final = 0.5
-"""The list of folders is read again only after this time, in seconds."""
+"""Shortest time after which the list of folders is read again, in seconds."""
 _DAY: Final = re.compile(r"\d{4}-\d\d-\d\d")
 _LISTED_EVENTS: Final = frozenset(
     {"warning", "safe_state", "closed", "shot_repeated", "window_too_short", "window_exceeded"}
@@ -180,7 +183,7 @@ class Catalogue:
         self._open: OrderedDict[str, OpenRun] = OrderedDict()
         self._summaries: dict[Path, tuple[object, dict[str, Any]]] = {}
         self._folders: list[Path] = []
-        self._listed_s = -math.inf
+        self._list_again_s = -math.inf
 
     def folders(self) -> list[Path]:
         """The folders of all runs, the newest last.
@@ -189,7 +192,7 @@ class Catalogue:
             RecordingError: The data folder cannot be read.
         """
         with self._lock:
-            if time.monotonic() - self._listed_s > _LISTED_S:
+            if (start_s := time.monotonic()) > self._list_again_s:
                 try:
                     next(self.root.iterdir(), None)
                     self._folders = runs_in(self.root)
@@ -197,7 +200,9 @@ class Catalogue:
                     self._folders = []
                     reason = f"the data folder cannot be read: {error.strerror}"
                     raise RecordingError(self.root, reason, "it is read again at the next request") from error
-                self._listed_s = time.monotonic()
+                # pages ask ten times a second, and a folder of 100,000 runs takes a while to list
+                end_s = time.monotonic()
+                self._list_again_s = end_s + max(_LISTED_S, 20.0 * (end_s - start_s))
             return self._folders
 
     def newest(self) -> OpenRun | None:
@@ -253,11 +258,13 @@ class Catalogue:
         values = _summary(OpenRun(folder) if run is None or run.follower.is_replaced() else run)
         values |= self._results(folder) if values["status"] != "running" else {"scanned": "", "results": []}
         self._summaries[folder] = (stamp, values)
+        for oldest in [*self._summaries][:-_MAX_SUMMARIES]:
+            self._summaries.pop(oldest, None)
         return values
 
     def _results(self, folder: Path) -> dict[str, Any]:
         """What a run that has ended scanned and measured, as `labseq runs` shows it."""
-        entry = next(entries(self.root, [(folder.parent.name, folder.name)]))
+        entry = next(entries(self.root, [_day_and_name(folder)]))
         return {
             "scanned": text_of(entry.scanned_text, 400),
             "results": [
@@ -266,19 +273,20 @@ class Catalogue:
         }
 
     def warm(self) -> None:
-        """Read all runs for the list once, the newest first, at a pace that leaves room for answers."""
+        """Read all runs for searches once, the newest first, at a pace that leaves room for answers."""
         with suppress(RecordingError, OSError):
             if (newest := self.newest()) is not None:
                 newest.history.update()
-            for folder in self.folders()[::-1]:
-                self.summary(folder)
-                time.sleep(0.001)
+            names = [_day_and_name(folder) for folder in self.folders()[::-1]]
+            for first in range(0, len(names), 100):  # what was read is kept after each hundred
+                for _ in entries(self.root, names[first : first + 100]):
+                    time.sleep(0.001)
 
     def search(self, text: str, status: str, first: int, most: int) -> dict[str, Any]:
-        """The newest runs whose line contains all the words.
+        """The newest runs that contain all the words, from those that could be read within SEARCH_S.
 
         Args:
-            text: Words that date, name, profile, outcome, comment or tags must contain.
+            text: Words that date, name, profile, results, comment or tags must contain.
             status: Only runs of this status; "" for all.
             first: Number of newer ones to leave out.
             most: Maximum number of runs.
@@ -286,21 +294,31 @@ class Catalogue:
         Raises:
             RecordingError: The data folder cannot be read.
         """
-        folders = self.folders()[::-1]
-        words = text.lower().split()
-        if not words and not status:
-            runs = [self.summary(folder) for folder in folders[first : first + most]]
-            return {"n_runs": len(folders), "n_found": len(folders), "runs": runs}
-        matching = [
-            summary
-            for folder in folders
-            if _matches(summary := self.summary(folder), words) and status in ("", summary["status"])
-        ]
+        matching = folders = self.folders()[::-1]
+        n_read, words = len(folders), text.lower().split()
+        if words or status:
+            end_s, n_read = time.monotonic() + SEARCH_S, 0
+
+            def names() -> Iterator[tuple[str, str]]:
+                nonlocal n_read
+                for folder in folders:
+                    if time.monotonic() > end_s:
+                        return
+                    n_read += 1
+                    yield _day_and_name(folder)
+
+            found = entries(self.root, names(), words)
+            matching = [entry.path for entry in found if status in ("", entry.status)]
         return {
             "n_runs": len(folders),
             "n_found": len(matching),
-            "runs": matching[first : first + most],
+            "n_unread": len(folders) - n_read,
+            "runs": [self.summary(folder) for folder in matching[first : first + most]],
         }
+
+
+def _day_and_name(folder: Path) -> tuple[str, str]:
+    return folder.parent.name, folder.name
 
 
 def run_id(folder: Path) -> str:
@@ -314,14 +332,6 @@ def _stamp(path: Path) -> object:
     except OSError:
         return None
     return status.st_ino, status.st_mtime_ns, status.st_size
-
-
-def _matches(summary: Mapping[str, Any], words: Iterable[str]) -> bool:
-    keys = ("id", "name", "profile", "status", "outcome", "comment", "started_utc", "error")
-    text = " ".join(str(summary[key] or "") for key in keys).lower()
-    text += " ".join(summary["tags"]).lower() + (" simulated" if summary["simulated"] else "")
-    text += " ".join([summary["scanned"], *(one["text"] for one in summary["results"])]).lower()
-    return all(word in text for word in words)
 
 
 def _summary(run: OpenRun) -> dict[str, Any]:

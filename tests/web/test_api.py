@@ -15,6 +15,8 @@ from numpy.testing import assert_allclose
 
 from labseq.analysis.statistics import statistics_of
 from labseq.calibration_store import encode_entry
+from labseq.data.described import read_entry
+from labseq.data.entry import RunEntry
 from labseq.data.follower import Follower
 from labseq.data.reader import open_run
 from labseq.files import write_file
@@ -132,6 +134,31 @@ def test_list_is_searched_by_name_status_and_comment(run_dir: Path, tmp_path: Pa
         ("q=kagome lens", []),
     ):
         assert [run["name"] for run in answers(client, f"/api/v1/runs?{query}")["runs"]] == expected
+
+
+def test_a_search_reads_each_run_once_and_not_longer_than_a_page_waits(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, read = run_dir.parent.parent, list[Path]()
+    for number in range(2, 6):
+        shutil.copytree(run_dir, run_dir.with_name(f"{number:04}_copy"))
+
+    def noting(folder: Path) -> RunEntry:
+        read.append(folder)
+        return read_entry(folder)
+
+    monkeypatch.setattr("labseq.data.described.read_entry", noting)
+    monkeypatch.setattr("labseq.data.catalogue.SETTLED_S", 0.0)
+    monkeypatch.setattr("labseq.web.runs.SEARCH_S", -1.0)
+    catalogue = Catalogue(root)
+    answer = catalogue.search("complete", "", 0, 50)
+    assert (answer["n_runs"], answer["n_found"], answer["n_unread"], read) == (5, 0, 5, [])
+    monkeypatch.setattr("labseq.web.runs.SEARCH_S", 60.0)
+    answer = catalogue.search("complete", "", 0, 2)
+    assert (answer["n_found"], answer["n_unread"], len(answer["runs"])) == (5, 0, 2)
+    read.clear()
+    assert Catalogue(root).search("simulated", "complete", 0, 0)["n_found"] == 5
+    assert read == []  # also after the server was started again
 
 
 def test_a_run_that_grows_and_one_that_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
