@@ -19,17 +19,19 @@ myst_heading_anchors = 3
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["_build"]
 smartquotes = False  # quotes and dashes are to be copied
-html_theme = "alabaster"
+html_theme = "furo"
+html_title = f"labseq {release}"
 html_static_path = ["_static"]
 html_css_files = ["labseq.css"]
-html_theme_options = {"description": release, "page_width": "1100px"}
+html_show_sphinx = False
+html_theme_options = {"top_of_page_buttons": []}
 
 
 def add_parts(_app: object, page: str, source: list[str]) -> None:
     """Put the generated parts of the reference into a page; make the links of an index page its contents."""
     source[0] = complete(source[0])
-    if page.rpartition("/")[2] == "index":
-        pages = dict.fromkeys(re.findall(r"\]\(([\w-]+(?:/index)?)\.md\)", source[0]))
+    if page.endswith("/index"):
+        pages = dict.fromkeys(re.findall(r"\]\(((?:\.\./explanation/)?[\w-]+)\.md\)", source[0]))
         source[0] += "\n```{toctree}\n:hidden:\n\n" + "\n".join(pages) + "\n```\n"
 
 

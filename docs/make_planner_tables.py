@@ -7,7 +7,7 @@ The first command replaces the parts of the page between ``<!-- measured: NAME -
 or one of them. Times are those of this machine: let nothing else run. The second prints and draws one of
 the paper's figures 2b, 2c, 3a and 3b, at the paper's loading or another one. What the paper leaves open is
 chosen here: the size of the grid next to that of the target, and in figure 3 the degree of parallelism; see
-``docs/explanation/planners.md``.
+``docs/develop/planner-figures.md``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from labseq.model.estimate import Estimate
 from labseq.units import format_quantity
 
 DOCS = Path(__file__).parent
-PAGE = DOCS / "explanation" / "planners.md"
+PAGE = DOCS / "develop" / "planner-figures.md"
 PICTURES = DOCS / "_static" / "planners"
 
 PLANNERS = "psca,psca:variant=paper,tetris,mta1,hca,compression,lsap,lsap_squared"

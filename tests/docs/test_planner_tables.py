@@ -16,7 +16,7 @@ from tests.plugins.planning import COMPACT, plan_and_check, psca
 from .scripts import load_script
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "explanation" / "planners.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "develop" / "planner-figures.md").read_text(encoding="utf-8")
 
 
 SCRIPT = load_script("make_planner_tables")

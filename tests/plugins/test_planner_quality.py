@@ -1,7 +1,7 @@
 """How good the plans are: what each planner costs on fixed loadings, so that none gets worse unnoticed.
 
 Every figure is the mean over loadings that never change, and plans have no randomness: what is measured here
-is the same on every machine. docs/explanation/planners.md has larger samples of the same kind:
+is the same on every machine. docs/develop/planner-figures.md has larger samples of the same kind:
 18.47(4) batches for ``psca``.
 """
 
