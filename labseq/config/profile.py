@@ -215,7 +215,9 @@ class LinesChoice(Choice):
 
     def specs(self) -> tuple[LineSpec, ...]:
         """The lines, in the order of their channels."""
-        return tuple(sorted(self.channels.values(), key=lambda spec: spec.channel))
+        # shorter ones first, so that output 10 follows output 9
+        names = {spec: str(spec.channel) for spec in self.channels.values()}
+        return tuple(sorted(names, key=lambda spec: (len(names[spec]), names[spec])))
 
 
 @with_settings_of(MotionSpec)

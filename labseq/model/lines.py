@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeInt, model_validator
+from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 from pydantic.dataclasses import dataclass as settings
 
 from labseq.model.grid import read_only
@@ -27,6 +27,18 @@ Pulses: TypeAlias = Mapping[str, Sequence[Span]]
 NO_PULSES: Final[Pulses] = {}
 
 
+def _has_slash(name: str) -> str:
+    if "/" not in name:
+        raise ValueError("expected a whole number, or a name with a slash such as 'Dev1/port0/line3'")
+    return name
+
+
+Channel: TypeAlias = Annotated[
+    NonNegativeInt | Annotated[str, AfterValidator(_has_slash)], Field(union_mode="left_to_right")
+]
+"""An output of a timing box: its number, or a name such as those of National Instruments."""
+
+
 _TRIGGERED: Final = {"camera": "image", "mobile_tweezers": "rearrange"}
 """Role -> the kind of step that begins with its trigger."""
 
@@ -36,7 +48,10 @@ class LineSpec:
     """A line: its output on the timing box, and when it is on."""
 
     name: OwnName
-    channel: Annotated[NonNegativeInt, Field(description="output of the timing box")]
+    channel: Annotated[
+        Channel,
+        Field(description="output of the timing box: its number, or its name such as `Dev1/port0/line3`"),
+    ]
     on: Annotated[
         tuple[Text, ...],
         Field(
@@ -117,14 +132,14 @@ class LinesFacts:
     """Facts about a timing box that are known before it is opened.
 
     Attributes:
-        channels: Numbers of its outputs.
+        channels: Its outputs, as ``LineSpec.channel`` names them; empty if not known before it is open.
         resolution_s: Step of its clock: edges fall on multiples of it.
         shortest_s: Least time between two edges.
         max_edges: Most edges of a program.
         latency_s: From the call of ``fire`` to the first edge.
     """
 
-    channels: tuple[int, ...]
+    channels: tuple[int | str, ...]
     resolution_s: float = 0.0
     shortest_s: float = 0.0
     max_edges: int = 2**31

@@ -67,8 +67,9 @@ class Slots:
 
 
 def mask_of(row: Sequence[bool], specs: Sequence[LineSpec]) -> int:
-    """The lines that are on, as the box counts them: bit n is channel n."""
-    return sum(1 << spec.channel for spec, is_on in zip(specs, row, strict=True) if is_on)
+    """The lines that are on, as the box counts them: bit n is channel n. ``open`` refuses other channels."""
+    channels = [spec.channel for spec, is_on in zip(specs, row, strict=True) if is_on]
+    return sum(1 << channel for channel in channels if isinstance(channel, int))
 
 
 def _edge(program: LineProgram, i: int) -> str:

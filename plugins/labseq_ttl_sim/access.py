@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from labseq_ttl.access import MAX_WAIT_S
 from labseq_ttl.box import late_error
+from labseq_ttl.programs import mask_of
 from labseq_ttl.protocol import TICK_S, Edge
 from labseq_ttl.settings import TtlSettings
 
@@ -98,10 +99,10 @@ class SimulatedAccess:
 
 def as_played(edges: Sequence[Edge], program: LineProgram, specs: Sequence[LineSpec]) -> LineProgram:
     """The played edges as a program, in ticks since the first; those that changed nothing are left out."""
-    ours = sum(1 << spec.channel for spec in specs)  # other outputs may belong to a leader
-    edges = [(tick, mask & ours) for tick, mask in edges]
+    bits = [mask_of([True], [spec]) for spec in specs]  # other outputs may belong to a leader
+    edges = [(tick, mask & sum(bits)) for tick, mask in edges]
     changes = [edge for i, edge in enumerate(edges) if i == 0 or edge[1] != edges[i - 1][1]]
-    on = [[bool(mask >> spec.channel & 1) for spec in specs] for _, mask in changes]
+    on = [[bool(mask & bit) for bit in bits] for _, mask in changes]
     t_s = np.array([tick for tick, _ in changes], np.float64) * TICK_S
     states = np.array(on, np.bool_).reshape(len(changes), len(specs))
     return LineProgram(program.kind, program.lines, t_s, states, program.begin_s, program.duration_s)

@@ -43,7 +43,11 @@ class VirtualLines(VirtualDriver, Lines):
     def lines_facts(self) -> LinesFacts:
         """Channels and limits."""
         settings = self._settings
-        channels = tuple(range(settings.n_channels))
+        named = (spec.channel for spec in self._specs if isinstance(spec.channel, str))
+        channels = (
+            *range(settings.n_channels),
+            *named,
+        )  # a dry run stands in for boxes that name their outputs
         return LinesFacts(channels, settings.resolution, settings.shortest, settings.max_edges)
 
     def idle(self) -> None:
