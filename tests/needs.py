@@ -54,6 +54,7 @@ def _compiles(compiler: str, suffix: str, header: str) -> bool:
 NEEDS = {
     "pypylon": _package("pypylon"),
     "hdf5plugin": _package("hdf5plugin"),
+    "nidaqmx": _package("nidaqmx"),
     "pyarrow": _package("pyarrow"),
     "ruff": _package("ruff"),
     "browser": Need(

@@ -17,6 +17,7 @@ from typing import Any, cast
 import h5py
 import pytest
 from labseq_frames.files import BadFramesError, load
+from labseq_nidaqmx.library import import_package
 from labseq_optuna.scanner import OptunaScanner, OptunaSettings
 from labseq_pylon.library import load_pypylon
 
@@ -54,6 +55,7 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("compress", "hdf5plugin", "hdf5plugin"): lambda: load_filter(Path("shot.h5"), compressed()),
     ("frames", "tifffile", "tifffile"): lambda: load("tifffile", "tifffile", Path("a.tif")),
     ("frames", "pillow", "PIL.Image"): lambda: load("PIL.Image", "Pillow", Path("a.png")),
+    ("nidaqmx", "nidaqmx", "nidaqmx"): lambda: import_package("lines"),
     ("optuna", "optuna", "optuna"): lambda: OptunaScanner(OptunaSettings(), ScanSpace((), 1)),
     ("plot", "matplotlib", "matplotlib"): lambda: check_place(Path("a.png")),
     ("plot", "pillow", "PIL"): lambda: read_drawing(ROOT / "docs" / "_static" / "plan_kagome.png", "#"),

@@ -1,0 +1,16 @@
+"""Lines on cards of National Instruments, through NI-DAQmx."""
+
+from labseq.plugin import Registry, hookimpl
+
+LABSEQ_API = 1
+
+
+@hookimpl
+def labseq_register(registry: Registry) -> None:
+    """Offer the lines ``nidaqmx``; in a dry run the cards are simulated."""
+    registry.lines(
+        "nidaqmx",
+        "labseq_nidaqmx.lines:NidaqmxLines",
+        "labseq_nidaqmx.settings:NidaqmxSettings",
+        simulated="labseq_nidaqmx.library:simulated_settings",
+    )

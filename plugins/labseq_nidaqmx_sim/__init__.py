@@ -1,0 +1,5 @@
+"""A simulator of NI-DAQmx for ``labseq_nidaqmx``: cards behind the functions of its C library."""
+
+from labseq_nidaqmx_sim.access import SimulatedLibrary
+
+__all__ = ["SimulatedLibrary"]
