@@ -55,6 +55,7 @@ _HOMES = {
     "labseq.data.catalogue": ("runs",),
     "labseq.data.entry": ("RunEntry",),
     "labseq.data.reader": ("Run", "open_run"),
+    "labseq.session.asked": ("ShotResult", "serve"),
     "labseq.session.session": ("Session",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

@@ -46,6 +46,7 @@ from labseq.model import (
 )
 from labseq.motion import check_plan as check_plan
 from labseq.motion.rendering import render as render
+from labseq.session.asked import ShotResult as ShotResult, serve as serve
 from labseq.session.session import Session as Session
 
 __version__: str

@@ -33,6 +33,7 @@ from labseq.roles import Context, Step
 from labseq.settings import settings_of
 
 if TYPE_CHECKING:
+    from labseq.assembly.led import LedPoints
     from labseq.assembly.points import ScanPoints
     from labseq.assembly.recorded import RecordedFiles
     from labseq.assembly.search import Search
@@ -56,6 +57,7 @@ class Assembly:
         scanned: The points of the scan; None without one.
         policy: Reactions to failures and exceeded budgets.
         search: The scanner, if it chooses the points during the run.
+        led: What another control system may set for each shot; None for nothing.
     """
 
     document: Document
@@ -68,6 +70,7 @@ class Assembly:
     scanned: ScanPoints | None = None
     policy: RunPolicy = field(default_factory=RunPolicy)
     search: Search | None = None
+    led: LedPoints | None = None
 
     @property
     def virtual_time(self) -> bool:
@@ -108,6 +111,8 @@ class Assembly:
     @property
     def _alone(self) -> Point:
         """The settings of the files."""
+        if self.led is not None:
+            return self.led.at(0)
         return Point(self.planner, self.steps, self.hardware, {}, self.document)
 
 
@@ -218,6 +223,11 @@ def _assembled(
         scanned = ScanPoints(scan.bound(hardware.document), document, sequence, hardware)
         scanned.check(problems)
         search = make_search(scanned, steps, results, target, problems)
+    led: LedPoints | None = None
+    if sequence.leader is not None and is_whole and not problems.problems:
+        from labseq.assembly.led import led_points  # most runs have no leader
+
+        led = led_points(document, sequence, hardware, problems)
     problems.raise_any()
     assert target is not None  # else there was a problem
     assert planner is not None
@@ -231,7 +241,7 @@ def _assembled(
     }
     resolved = _core_dump(sequence) | chosen | _optional_dump(target, document, hardware.document)
     parts = (document, sequence, hardware, target, planner, tuple(steps), resolved)
-    return Assembly(*parts, scanned, policy=policy, search=search)
+    return Assembly(*parts, scanned, policy=policy, search=search, led=led)
 
 
 def _check_alone(document: Document, sequence: SequenceSpec, problems: ProblemCollector) -> None:
@@ -252,6 +262,7 @@ def _check_alone(document: Document, sequence: SequenceSpec, problems: ProblemCo
 def _core_dump(sequence: SequenceSpec) -> dict[str, Any]:
     """What a sequence says apart from its plugins, its scan and its quantities."""
     others = {"shot", "target", "planner", "scan", "measure", "regions"}
+    others |= {"leader"} if sequence.leader is None else set()
     return sequence.model_dump(mode="json", exclude=others)
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from labseq.assembly.profile import ResolvedProfile
     from labseq.config.document import Document
     from labseq.config.sequence import StepSpec
+    from labseq.model import TargetPattern
     from labseq.registry import Entry
     from labseq.roles import Step
 
@@ -37,6 +38,7 @@ class Point:
         hardware: The profile.
         parameters: Scanned address -> value, SI, JSON-ready.
         document: The sequence's file with the values of the point.
+        target: The target; None for that of the run.
     """
 
     planner: ChosenPlugin
@@ -44,6 +46,7 @@ class Point:
     hardware: ResolvedProfile
     parameters: Mapping[str, Any]
     document: Document
+    target: TargetPattern | None = None
 
     @property
     def lab_key(self) -> tuple[int, int]:

@@ -190,6 +190,12 @@ class ScanPoints:
         locs = [] if expressions is None else expressions.following(axis.loc)
         return [loc for loc in locs if loc[0] != VARIABLES]
 
+    def _may_change(self, of_profile: bool, loc: Loc) -> bool:
+        """Whether a setting may differ between points."""
+        if of_profile:
+            return loc[0] in PROFILE_ROLES or (loc[0] == "devices" and len(loc) > 2)
+        return loc[0] == "planner" or (loc[0] == "shot" and len(loc) > 3)
+
     def _check_dependents(self) -> None:
         """Raise for an axis that changes no setting, or a setting that must be the same in the whole run."""
         for axis in self.scan.axes:
@@ -199,7 +205,7 @@ class ScanPoints:
                 what = f"no setting uses '{own}'"
                 raise axis.key.error(what, "an expression with it", hint)
             for loc in dependents:
-                if not _may_be_scanned(axis.of_profile, loc):
+                if not self._may_change(axis.of_profile, loc):
                     other = clean(_address(axis.of_profile, loc))
                     what = f"'{other}' depends on '{own}', and a scan cannot change it"
                     raise axis.key.error(what, "one value of it for the whole run")
@@ -234,12 +240,6 @@ def _changed(hardware: ResolvedProfile, document: Document) -> ResolvedProfile:
                 profile = profile.model_copy(update={"mobile_tweezers": new_choice})
     problems.raise_any()
     return replace(hardware, document=document, profile=profile, chosen=chosen)
-
-
-def _may_be_scanned(of_profile: bool, loc: Loc) -> bool:
-    if of_profile:
-        return loc[0] in PROFILE_ROLES or (loc[0] == "devices" and len(loc) > 2)
-    return loc[0] == "planner" or (loc[0] == "shot" and len(loc) > 3)
 
 
 def _address(of_profile: bool, loc: Loc) -> str:
@@ -305,6 +305,7 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
         **{role: objects[role] for role in roles if role in objects},
         devices={name: objects.get(name, device) for name, device in lab.devices.items()},
         motion=motion,
+        target=after.target or lab.target,
         planner_name=after.planner.entry.name,
         degree_of_parallelism=parallelism_of(after.planner, objects["planner"], motion),
         random_streams=_streams(lab.random_streams, streams),

@@ -14,7 +14,7 @@ from labseq.errors import ConfigError, DeviceError, ProblemCollector
 from labseq.guard import Guard, StopFlag
 from labseq.messages import clean, format_plugin_error
 from labseq.model import ScanRange, ScanSpace, TargetPattern, VisitedPoint
-from labseq.recording.run_file import SCANNER
+from labseq.recording.run_file import SCANNER, WRITTEN_UNITS
 from labseq.units import written
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class Search:
         """The scan for the run's record, JSON-ready; the points are in the index."""
         return {
             "addresses": [range_.address for range_ in self.ranges],
-            "written_units": self.units,
+            WRITTEN_UNITS: self.units,
             "ranges": [asdict(range_) for range_ in self.ranges],
             SCANNER: self.chosen.dump(),
             "figure": self.scan.choice.quantity,

@@ -32,7 +32,7 @@ from labseq.data.series import Series
 from labseq.model import ImageRecord, RunRecord, StageTiming
 from labseq.model.estimate import jeffreys
 from labseq.recording.index import IndexRow
-from labseq.recording.run_file import SCANNER
+from labseq.recording.run_file import WRITTEN_UNITS
 from labseq.units import format_quantity
 
 REDRAW_S: Final = 0.25
@@ -163,7 +163,7 @@ class ScanTally:
 
     def __init__(self, scan: Mapping[str, Any]) -> None:
         self._scan = scan
-        self._chosen = ChosenPoints(scan) if SCANNER in scan else None
+        self._chosen = ChosenPoints(scan) if WRITTEN_UNITS in scan else None
         self.lines = defaultdict[int, list[int]](list)
 
     @property

@@ -17,7 +17,7 @@ from labseq.data.results import own_fits, reported
 from labseq.data.scanned import on_axes
 from labseq.data.series import Series
 from labseq.errors import RecordingError
-from labseq.recording.run_file import SCANNER
+from labseq.recording.run_file import WRITTEN_UNITS
 
 PAUSE: Final = 100.0
 """Minimum time between two fits, as a multiple of what the last one took: they delay shots by 1 % at most."""
@@ -69,7 +69,7 @@ class LiveFits:
 
     def _fit(self, lines: Mapping[int, Sequence[int]]) -> None:
         run = self._run = self._run or open_run(self._run_dir)
-        scan = None if SCANNER in run.scan else on_axes(run.scan, planned_points(run.scan))
+        scan = None if WRITTEN_UNITS in run.scan else on_axes(run.scan, planned_points(run.scan))
         if scan is None or len(scan.axes) != 1:
             self._series = []
             return

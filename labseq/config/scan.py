@@ -519,6 +519,21 @@ def _placed(axis: _A, document: Document) -> _A:
     raise _unscannable(axis)
 
 
+def leader_axis(address: str, mark: Mark, document: Document) -> Axis:
+    """An address that another control system may set, as an axis without values.
+
+    Raises:
+        ConfigError: It does not exist, or can only be set for a whole run.
+    """
+    axis = _found(Axis(address, (), (), mark), document)
+    loc, top = axis.loc, axis.loc[0]
+    is_step = top == "shot" and len(loc) > 3 and document.root.at(loc[:3]) is not None
+    if is_step or top in ("planner", "target", VARIABLES):
+        return axis
+    expected = "an address in 'planner', 'target', 'shot.N.<step>' or 'variables'"
+    raise mark.error(f"a leader cannot set '{clean(address)}'", expected)
+
+
 def _placed_in_profile(axis: Axis, document: Document) -> Axis:
     axis = _found(axis, document)
     if axis.loc[0] in (*PROFILE_ROLES, VARIABLES) or (axis.loc[0] == "devices" and len(axis.loc) > 1):

@@ -243,6 +243,14 @@ Steps: TypeAlias = Annotated[
 """The steps of a shot, in order."""
 
 
+class LeaderPermissions(Settings):
+    """``leader`` of a sequence: what another control system may set for each shot."""
+
+    may_set: Annotated[tuple[Text, ...], Field(min_length=1)] = Field(
+        description="addresses in `planner`, `target`, `shot.N.<step>` or `variables`, as for `--set`"
+    )
+
+
 class SequenceSpec(Settings):
     """A sequence file; the settings of its plugins are checked later."""
 
@@ -278,6 +286,9 @@ class SequenceSpec(Settings):
     )
     repeats: int = Field(default=1, ge=1, le=1_000_000, description="shots of each point of the scan")
     order: ScanOrder = Field(default="sequential", description="order of the scan's shots")
+    leader: LeaderPermissions | None = Field(
+        default=None, description="what another control system may set for each shot, with its `go`"
+    )
     measure: Measures = Field(
         default=None,
         description="the quantities that the run is about, the most important first; "

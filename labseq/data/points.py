@@ -12,6 +12,7 @@ from labseq.errors import RecordingError
 from labseq.plain import dumps
 from labseq.recording.folders import RUN_FILE
 from labseq.recording.index import IndexRow
+from labseq.recording.run_file import WRITTEN_UNITS
 from labseq.units import written
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def reporting_damage(run_dir: Path) -> Generator[None]:
 
 
 class ChosenPoints:
-    """The points that an adaptive scan has chosen, each once, in the order in which they were first taken.
+    """The points that an adaptive scan or a leader has chosen, each once, in the order in which they came.
 
     Args:
         scan: The scan's record in run.json.
@@ -48,7 +49,7 @@ class ChosenPoints:
         self.points: list[list[Any]] = []
         self.written: list[list[str]] = []
         self._addresses = [str(address) for address in scan["addresses"]]
-        self._units = [str(unit) for unit in scan["written_units"]]
+        self._units = [str(unit) for unit in scan[WRITTEN_UNITS]]
         self._numbers: dict[str, int] = {}
 
     def number(self, parameters: Mapping[str, Any]) -> int:
@@ -62,8 +63,14 @@ class ChosenPoints:
         number = self._numbers.setdefault(dumps(values), len(self.points))
         if number == len(self.points):
             self.points.append(values)
-            self.written.append([written(v, unit) for v, unit in zip(values, self._units, strict=True)])
+            self.written.append([_written(v, unit) for v, unit in zip(values, self._units, strict=True)])
         return number
+
+
+def _written(value: Any, unit: str) -> str:
+    """A value as a file would have it; only a leader sets others than numbers."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return written(value, unit) if is_number else value if isinstance(value, str) else dumps(value)
 
 
 def completed(scan: Mapping[str, Any], rows: Iterable[IndexRow]) -> dict[str, Any]:

@@ -17,7 +17,14 @@ from labseq.model.records import RunStatus
 from labseq.plain import to_plain
 from labseq.recording import folders
 from labseq.recording.index import read_index
-from labseq.recording.run_file import SCANNER, is_skip_row, read_run, read_state, read_state_file, target_of
+from labseq.recording.run_file import (
+    WRITTEN_UNITS,
+    is_skip_row,
+    read_run,
+    read_state,
+    read_state_file,
+    target_of,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -175,7 +182,7 @@ class Run:
             RecordingError: Its record in run.json or the index is damaged.
         """
         scan: Mapping[str, Any] = self.record.get("scan") or {}
-        if SCANNER not in scan:
+        if WRITTEN_UNITS not in scan:
             return scan
         from labseq.data.points import completed, reporting_damage
 
@@ -261,7 +268,7 @@ class Run:
             what = f"no shot meets {visible(' and '.join(conditions))}"
             raise ConfigError(Problem(what, clean(self.path.name)))
         scan = self.record.get("scan") or {}
-        if scan and SCANNER not in scan:
+        if scan and WRITTEN_UNITS not in scan:
             from labseq.data.points import reporting_damage, restricted
 
             with reporting_damage(self.path):

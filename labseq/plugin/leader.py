@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from typing import Final
 
 from pydantic import Field
 
-from labseq.errors import DeviceError, DeviceTimeoutError
-from labseq.roles import Context, Simulation
+from labseq.errors import DeviceError, DeviceTimeoutError, one_of
+from labseq.roles import Context, LeaderDialogue, Simulation
 from labseq.settings import Duration, PositiveDuration, Settings
 from labseq.units import format_quantity
 
 __all__ = [
     "GO",
+    "LEADER",
     "LeaderLog",
     "LeaderSettings",
     "check_signal",
     "load_atoms",
     "load_until_go",
+    "speaking_leader",
 ]
 
 GO: Final = "go"
 """The start signal."""
+LEADER: Final = "leader"
+"""What times a step that the other control system does."""
 
 
 class LeaderSettings(Settings):
@@ -64,6 +69,22 @@ class LeaderLog:
         new_events = [*self._events]
         self._events.clear()
         return new_events
+
+
+def speaking_leader(devices: Mapping[str, object], name: str = "") -> str:
+    """Why no control system can be asked for a step through a device; "" if it can.
+
+    Args:
+        devices: All hardware of the profile.
+        name: Name of the device; "" for the only one there is.
+    """
+    able = [other for other, device in devices.items() if isinstance(device, LeaderDialogue)]
+    if not able:
+        hint = "`leader: {use: tcp_leader}` among its `devices`"
+        return f"the profile has no device through which a leader speaks; expected {hint}"
+    if name in able or (not name and len(able) == 1):
+        return ""
+    return f"expected {one_of(able)} as `device`"
 
 
 def check_signal(signal: str, device: str) -> None:

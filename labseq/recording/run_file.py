@@ -24,6 +24,8 @@ from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, STAT
 
 SCANNER: Final = "scanner"
 """Key in the record of an adaptive scan (and no other): the scanner and its settings."""
+WRITTEN_UNITS: Final = "written_units"
+"""Key in the record of a scan whose points are chosen during the run: units in which they are written."""
 
 STATUSES: Final = ("running", "complete", "stopped", "failed")
 

@@ -70,6 +70,9 @@ class ShotEncoder:
         kept = self._frames_to_keep(shot.images)
         set_attributes(entry, {"default": "images_view" if kept else "detection"})
         write_fields(entry, schema.SHOT, shot)
+        if shot.target is not None and shot.target is not self._run.target:
+            for part, sites in (("fill", shot.target.fill), ("clear", shot.target.clear)):
+                entry[f"target/{part}"][...] = sites
         write_texts(entry, schema.SHOT_TEXTS, shot)
         write_values(
             entry.create_group("parameters"), shot.parameters, self._run.units, schema.PARAMETER.description

@@ -190,7 +190,7 @@ class RunWriter:
         file = self._free_name(shot.shot_index, shot.attempt, counts=shot.status == "complete")
         row = row_of_record(
             shot,
-            self.run.target,
+            shot.target or self.run.target,
             file=file,
             sha256="",
             n_bytes=data.nbytes,

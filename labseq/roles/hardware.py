@@ -452,7 +452,7 @@ class LeaderDialogue(LeaderLink, Protocol):
         """Whether the other system turns the imaging light on when it is asked to."""
         ...
 
-    def expect_values(self, check: Callable[[Mapping[str, str]], None]) -> None:
+    def expect_values(self, check: Callable[[Mapping[str, str]], object]) -> None:
         """From now on, check values that the other system sends in advance by this function, which raises."""
         ...
 

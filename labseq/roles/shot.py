@@ -260,6 +260,20 @@ class Shot(Protocol):
         """
         ...
 
+    def leave_to_leader(self, step: str, timeout_s: float, device: str = "") -> None:
+        """Let another control system do a step of its own.
+
+        Args:
+            step: Name of the step.
+            timeout_s: Longest time until it reports the end, in seconds.
+            device: Name of the device that it speaks through; "" for the only one there is.
+
+        Raises:
+            ConfigError: There is no such device.
+            DeviceError: It is not connected, leaves, or is not done in time.
+        """
+        ...
+
     def margin_s(self, kind: str) -> float:
         """Extra time that a kind of step takes for the leads and lags of its lines, in seconds."""
         ...
@@ -372,6 +386,19 @@ class StepContext:
     lines_facts: LinesFacts = field(default_factory=lambda: LinesFacts(()))
     static_tweezers: TweezersFacts = field(default_factory=TweezersFacts)
 
+    def leave_to_leader(self, step: str, timeout_s: float, device: str = "") -> None:
+        """Let another control system do a step of its own.
+
+        Args:
+            step: Name of the step.
+            timeout_s: Longest time until it reports the end, in seconds.
+            device: Name of the device that it speaks through; "" for the only one there is.
+
+        Raises:
+            ConfigError: There is no such device.
+            DeviceError: It is not connected, leaves, or is not done in time.
+        """
+
     def margin_s(self, kind: str) -> float:
         """Extra time that a kind of step takes for the leads and lags of its lines, in seconds."""
         return margin_s(self.lines, kind)
@@ -475,6 +502,7 @@ EVENTS: Final = {
     "leader_awaited": "labseq waits for a signal of the external control system",
     "leader_signal": "the signal has come",
     "leader_answered": "labseq has answered it",
+    "leader_turn": "the external control system does a step of its own",
     "leader_event": "what else the link to the external control system reports",
     "shot_repeated": "an attempt failed, and the shot is taken again",
     "shot_finished": "a shot is on disk, complete or not",

@@ -80,8 +80,12 @@ class LeaderAnswers:
         values = dict(self._values)
         for name, dialogue in self._dialogues.items():
             values |= self.guard.call(name, self.shot.call_timeout_s, dialogue.take_values)
-        if values:
-            self.shot.use(self._check(values))
+        if values or self.settings_for is not None:
+            settings, before = self._check(values), self.shot.lab.random_streams
+            self.shot.use(settings)
+            for stream in settings.lab.random_streams:
+                if stream not in before:
+                    stream.begin_shot(self.shot.index, self.shot.record.attempt)
         self._values = values
 
     def _check(self, values: Mapping[str, str]) -> ShotSettings:

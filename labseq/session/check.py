@@ -26,7 +26,7 @@ from labseq.messages import visible
 from labseq.model import COMPUTER, Frame, Plan, TimelineEntry
 from labseq.model.lines import NO_PULSES, LineProgram, Pulses
 from labseq.motion import tone_program
-from labseq.roles import Detector, Step, find_leader
+from labseq.roles import Detector, LeaderDialogue, Step, find_leader
 from labseq.sequencer.images import with_waits
 from labseq.sequencer.lab import Lab
 from labseq.sequencer.lines import line_program, own_duration_s, trigger_line
@@ -155,7 +155,9 @@ class _PointCheck:
     def ask_devices(self) -> None:
         """Have camera and lines check what each step of a shot would ask of them."""
         for spec, (_, bars) in zip(self.shot, self.timeline, strict=True):
-            for bar in bars:
+            for bar in {
+                (one.kind, one.duration_s, one.exposure_s, repr(one.pulses)): one for one in bars
+            }.values():
                 try:
                     if bar.exposure_s:
                         self.lab.step_context.camera.check_exposure(bar.exposure_s)
@@ -403,6 +405,22 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
     )
 
 
+def check_settings(run: PreparedRun, guard: Guard, point: Point, lab: Lab) -> list[list[TimelineEntry]]:
+    """Check the settings of a shot with the steps and devices of a running run; returns the timelines.
+
+    Raises:
+        ConfigError: What a step, camera or lines would refuse.
+    """
+    checks = _Checks(run, guard)
+    checks.detectors.append(lab.detector)
+    point_check = _PointCheck(checks, point, lab)
+    for ask in (_PointCheck.ask_steps, _PointCheck.ask_timeline, _PointCheck.ask_timing):
+        ask(point_check)
+    point_check.ask_devices()
+    checks.raise_problems()
+    return [[*bars] for _, bars in point_check.timeline]
+
+
 def _run_s(checks: _Checks) -> tuple[float, float]:
     """Minimum and maximum duration of the run, with each shot at its scan point, or at any corner of it."""
     run = checks.run
@@ -526,6 +544,8 @@ def _may_be_lit(assembly: Assembly, lab: Lab) -> bool:
         return True
     if any(step.device_setting or step.signal for _, step in assembly.steps):
         return True
+    if any(isinstance(device, LeaderDialogue) and device.asks_for_light for _, device in lab.hardware()):
+        return True
     return any("image" in spec.on and not spec.triggers for spec in lab.line_specs)
 
 
@@ -576,7 +596,8 @@ def _deadline_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]
         except ConfigError:  # no wait for a signal: another step's own attribute
             continue
         until = next((n for n in range(number + 1, len(waits)) if waits[n]), None)
-        longest_s = sum(bar.duration_s for _, bars in timeline[number + 1 : until] for bar in bars)
+        bars = [bar for _, of_step in timeline[number + 1 : until] for bar in of_step]
+        longest_s = sum(bar.duration_s for bar in bars if bar.timed_by.name != "leader")
         if longest_s > leader.deadline_s:
             longest = format_quantity(longest_s, "time")
             what = f"what follows takes up to {longest}, but '{name}' must be answered within "

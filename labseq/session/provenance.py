@@ -95,8 +95,10 @@ def run_record(
     """
     spec, hardware = assembly.sequence, assembly.hardware
     changed = {address: _setting(assembly, address, text) for address, text in changes.items()}
-    scanned = () if assembly.scanned is None else assembly.scanned.at(0).parameters
+    points = assembly.scanned or assembly.led
+    scanned = () if points is None else points.at(0).parameters
     at_points = {address: _setting(assembly, address) for address in scanned}
+    units = {address: one.unit for address, one in (changed | at_points).items() if one.unit}
     return RunRecord(
         name=spec.name,
         n_shots=spec.shots,
@@ -110,14 +112,14 @@ def run_record(
         profile_path=str(folder / hardware.document.path),
         resolved=assembly.resolved,
         overrides={address: setting._asdict() for address, setting in changed.items()},
-        units={address: one.unit for address, one in (changed | at_points).items() if one.unit},
+        units=units,
         devices={},
         plugins=code.plugins,
         provenance=gather_provenance(code.git) | {"folder": str(folder)},
         record_frames=spec.record_frames,
         grid_spacing_m=hardware.grid.spacing_m,
         lattice=hardware.grid.lattice,
-        scan=assembly.scan_record(seed),
+        scan=assembly.scan_record(seed) if assembly.led is None else assembly.led.record(units),
         steps=unique_names([name for name, _ in assembly.steps]),
         calibrations={kind: entry.id for kind, entry in hardware.calibrations.items()},
     )

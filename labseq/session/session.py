@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import signal
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -40,6 +40,8 @@ from labseq.session.sources import RunCode
 from labseq.watchdog import WATCHDOG_LOG, Watchdog
 
 if TYPE_CHECKING:
+    from labseq.sequencer.shot import ShotSettings
+    from labseq.session.asked import AskedShots, ShotResult
     from labseq.session.precision import Precision
     from labseq.session.resume import ResumableRun
 
@@ -92,7 +94,16 @@ class Shots:
             parameters=self._parameters(first),
             watchdog=watchdog,
             place_of=writer.place_of,
+            settings_for=self._settings_for(lab, first),
         )
+
+    def _settings_for(self, lab: Lab, first: Point) -> Callable[[Mapping[str, str]], ShotSettings] | None:
+        """What makes the settings of a shot from the values of a leader; None if it may set none."""
+        if (led := self._run.assembly.led) is None:
+            return None
+        from labseq.session.led import LedShots  # most runs have no leader
+
+        return LedShots(self._run, led, lab, self._parameters(first))
 
     def _warn_of(self, alarm: str, text: str) -> None:
         self._run.observers.event("warning", {"text": text, "alarm": alarm})
@@ -197,6 +208,7 @@ class Session(PreparedRun):
         # before devices are opened: some vendors' libraries change the working folder
         self._cwd, self._profile_key = Path.cwd(), assembly.hardware.key
         self._lost = ""
+        self._asked: AskedShots | None = None
 
     @classmethod
     def open(
@@ -317,9 +329,29 @@ class Session(PreparedRun):
         self.close()
 
     def close(self) -> None:
-        """Let other processes resume the run; legal at any time, for only :meth:`run` has devices open."""
+        """End the run of :meth:`shot`; let other processes resume the run. Legal at any time."""
+        if self._asked is not None:
+            self._asked.end()
         if self.earlier is not None:
             self.earlier.release()
+
+    def shot(self, values: Mapping[str, Any] | None = None) -> ShotResult:
+        """Take the next shot; the first call opens the devices, and :meth:`close` makes them safe.
+
+        The run goes on in a thread between the calls, and ends after as many shots as the sequence says.
+
+        Args:
+            values: Address -> value for this shot; the sequence allows them in `leader: {may_set: [...]}`.
+
+        Raises:
+            ConfigError: A value is wrong or not allowed, and nothing was switched; or no shot is left.
+            LabseqError: The error that ended the run; devices are safe, the data is on disk.
+        """
+        if self._asked is None:
+            from labseq.session.asked import AskedShots  # most runs take their shots by themselves
+
+            self._asked = AskedShots(self)
+        return self._asked.take(values or {})
 
     def run(self) -> Run:
         """Take all shots.

@@ -16,7 +16,7 @@ from labseq.data.shot import Shot
 from labseq.errors import LabseqError
 from labseq.model.estimate import Estimated
 from labseq.model.image_quantities import OF_IMAGES, parse_name
-from labseq.recording.run_file import SCANNER
+from labseq.recording.run_file import SCANNER, WRITTEN_UNITS
 from labseq.web.fitting import LiveFit
 from labseq.web.runs import OpenRun, text_of
 from labseq.web.series import about_quantity, finite, mean_values
@@ -86,7 +86,7 @@ class ScanView:
 
     def _compute(self, read_s: float) -> dict[str, Any]:
         run, scan = self._run, self._run.record["scan"]
-        shown = scanned(open_run(run.folder) if SCANNER in scan else run.outline())
+        shown = scanned(open_run(run.folder) if WRITTEN_UNITS in scan else run.outline())
         if self._own is not None:
             for row in run.history.rows(len(self._own)):
                 self._own.add(row)
@@ -108,7 +108,7 @@ class ScanView:
             **head,
             "axes": [_axis(shown, i) for i in range(len(shown.axes))],
             "is_map": shown.is_map,
-            "n_planned": None if SCANNER in scan else len(scan.get("points") or ()),
+            "n_planned": None if WRITTEN_UNITS in scan else len(scan.get("points") or ()),
             "quantities": [self._quantity(*one, shown) for one in zip(series, means, strict=True)],
             "points": [
                 _point(point, shown.places[i], [one[i] for one in means])

@@ -7,7 +7,9 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the devices that connect an external control system; in a dry run it is simulated."""
+    """Offer the step and the devices of an external control system; in a dry run it is simulated."""
+    steps = "labseq_follow.steps"
+    registry.step("leader", f"{steps}:LeaderStep", f"{steps}:LeaderStepSettings")
     for kind, settings in (("tcp_leader", "TcpLeaderSettings"), ("serial_leader", "SerialLeaderSettings")):
         factory, model = f"labseq_follow.leader:{kind}", f"labseq_follow.settings:{settings}"
         registry.device(kind, factory, model, simulated={"leader": "simulated"})

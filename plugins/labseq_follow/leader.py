@@ -75,7 +75,7 @@ class LeaderDevice(Device):
         self._dialogue = Dialogue(self._settings.deadline, self._context.grid.shape)
         self._splitter = Splitter()
         self._failure: BaseException | None = None
-        self._check: Callable[[Mapping[str, str]], None] | None = None
+        self._check: Callable[[Mapping[str, str]], object] | None = None
         self._is_in_shot = False
 
     @property
@@ -180,7 +180,7 @@ class LeaderDevice(Device):
         if self._dialogue.awaited == "dark":
             self._await_reply("its imaging light may be on", self._settings.light_timeout)
 
-    def expect_values(self, check: Callable[[Mapping[str, str]], None]) -> None:
+    def expect_values(self, check: Callable[[Mapping[str, str]], object]) -> None:
         """Check the values of `set` by this function; see ``labseq.plugin.LeaderDialogue``."""
         self._check = check
 
@@ -214,8 +214,6 @@ class LeaderDevice(Device):
             DeviceTimeoutError: The light was not on in time.
         """
         limit_s = self._settings.light_timeout
-        if self._dialogue.awaited == "dark":
-            self._await_reply("its imaging light may be on from the last image", limit_s)
         self._request("light", {"exposure_s": exposure_s, "shot": shot}, "lit", limit_s)
         self._await_reply("its imaging light is not on", limit_s)
 
@@ -307,6 +305,8 @@ class LeaderDevice(Device):
     def _request(self, word: str, facts: About, reply: str, longest_s: float) -> None:
         """Ask the control system for something that it replies to."""
         self._check_open()
+        if reply != self._dialogue.awaited == "dark":
+            self._await_reply("its imaging light may be on", self._settings.light_timeout)
         with self._changed:
             if self._link.listens and not self._dialogue.is_connected:
                 raise DeviceError(self._name, f"no leader is connected that could answer '{word}'")

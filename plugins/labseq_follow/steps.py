@@ -1,0 +1,56 @@
+"""The step ``leader``: what the other control system does in the middle of a shot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from pydantic import Field
+
+from labseq.plugin import (
+    PositiveDuration,
+    Settings,
+    Shot,
+    Step,
+    StepContext,
+    Text,
+    TimedBy,
+    TimelineEntry,
+)
+from labseq.plugin.leader import LEADER, speaking_leader
+
+
+class LeaderStepSettings(Settings):
+    """``leader``: let the external control system do a step of its own, such as the science."""
+
+    step: Text = Field(description="name of the step, which the control system receives")
+    timeout: PositiveDuration = Field(description="longest time until it is done; then the shot fails")
+    device: Text | None = Field(
+        default=None, description="device of the profile that it speaks through; needed if several could"
+    )
+
+
+class LeaderStep(Step):
+    """Tells the control system that it is its turn, and waits until it says that it is done."""
+
+    notes = ()
+
+    def __init__(self, settings: LeaderStepSettings) -> None:
+        self.settings = settings
+
+    def check_devices(
+        self,
+        devices: Mapping[str, object],
+        context: StepContext,  # noqa: ARG002 - of the role
+    ) -> Mapping[str, str]:
+        """Find the device that the control system speaks through."""
+        fault = speaking_leader(devices, self.settings.device or "")
+        return {"device" if self.settings.device else "step": fault} if fault else {}
+
+    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - of the role
+        """One entry, at most the timeout; it has no kind, because the control system may switch any light."""
+        settings = self.settings
+        return [TimelineEntry(f"leader: {settings.step}", settings.timeout, 0.0, timed_by=TimedBy(LEADER))]
+
+    def run(self, shot: Shot) -> None:
+        """Wait until it is done."""
+        shot.leave_to_leader(self.settings.step, self.settings.timeout, self.settings.device or "")

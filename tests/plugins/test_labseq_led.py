@@ -1,0 +1,253 @@
+"""Shots with values of another control system, its steps and its light; and shots that Python asks for."""
+
+from __future__ import annotations
+
+import re
+import socket
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from labseq_client import Answer, Image, LabseqError, Leader
+
+import labseq
+from labseq import ConfigError, Session
+from labseq.session.check import check
+
+from .labseq_follow_rig import MAX_WAIT_S, TcpPeer, token_file
+from .test_labseq_client import leader
+from .test_labseq_follow_session import ANY_PORT, FOLLOW, GUIDE, PATIENT, Led, run_led
+
+SCAN = re.search(r"<!-- file: led_scan.yaml -->\n```yaml\n(.*?)^```$", GUIDE, re.DOTALL | re.MULTILINE)
+PROGRAM = re.search(r"^```python\n(from itertools.*?)^```$", GUIDE, re.DOTALL | re.MULTILINE)
+MAY_SET = "leader={may_set: [shot.2.rearrange.cycles, planner.degree_of_parallelism, target.rows]}"
+SHORT_LIVED = ["profile.simulation.lifetime=300 ms", "profile.simulation.imaging_loss=0 %"]
+
+
+def test_a_scan_by_the_leader_of_the_guide_is_fitted_as_any_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert SCAN is not None
+    assert PROGRAM is not None
+    assert len(PROGRAM[1].splitlines()) <= 40
+    sequence = tmp_path / "led_scan.yaml"
+    sequence.write_text(SCAN[1])
+
+    def lead(address: str) -> None:
+        code = PROGRAM[1].replace("Leader()", f"Leader(port={address.rpartition(':')[2]})")
+        fewer = code.replace('"50 ms", "100 ms", "200 ms"', '"100 ms"').replace("[*points] * 5", "points")
+        exec(fewer, {})
+
+    observer = Led(lead)
+    options: dict[str, Any] = {"shots": 12, "seed": 1, "output": tmp_path, "observer": observer}
+    with Session.open(sequence, overrides=[ANY_PORT, PATIENT, *SHORT_LIVED], **options) as session:
+        observer.session = session
+        done = session.run()
+    assert len(capsys.readouterr().out.splitlines()) == 12
+    assert {len({*column}) for column in zip(*done.scan["points"], strict=True)} == {3, 2}
+    assert [shot.parameters["shot.sort.cycles"] for shot in done.shots][:4] == [1, 1, 2, 2]
+    assert [shot.cycles[-1].cycle + 1 for shot in done.shots[:4]] == [1, 1, 2, 2], "and it was done"
+    fits = done.fits("survival:before,after@target", "exponential", along="shot.hold.duration")
+    assert len(fits) == 4
+    decays = [fit.fit.parameters["decay"].value for fit in fits]
+    assert 0.2 < float(np.mean(decays)) < 0.4
+
+
+BAD = [
+    ({"shots": 3}, "the leader may not set 'shots'; expected one of 'shot.2.rearrange.cycles'"),
+    ({"shot.7.rearrange.cycles": 1}, "'shot' has no item '7'"),
+    ({"planner.use": "lsap"}, "the leader may not set 'planner.use'"),
+    ({"shot.2.rearrange.cycles": "many"}, "cycles is 'many'; expected a whole number"),
+    ({"shot.2.rearrange.cycles": 0}, "cycles"),
+    ({"target.rows": 30}, "the size of the target is 30 rows x 15 columns; the limit is the grid"),
+    ({"target.rows": [3]}, "rows"),
+]
+
+
+def test_a_wrong_value_is_refused_before_anything_is_switched(tmp_path: Path) -> None:
+    answers: list[Answer] = []
+
+    def lead(address: str) -> None:
+        with leader(address) as labseq:
+            for values, reason in BAD:
+                labseq.go("bad", values)
+                answers.append(labseq.wait(MAX_WAIT_S))
+                assert reason in answers[-1].reason
+                assert (answers[-1].is_refused, answers[-1].images) == (True, [])
+            with pytest.raises(LabseqError, match="target is 99 rows"):
+                labseq.set({"target.rows": 99})
+            labseq.set({"target.rows": 9})
+            labseq.set({"shot.2.rearrange.cycles": 2})
+            labseq.go("good", {"shot.2.rearrange.cycles": 1})
+            answers.append(labseq.wait(MAX_WAIT_S))
+            labseq.go()
+            answers.append(labseq.wait(MAX_WAIT_S))
+
+    done = run_led(lead, tmp_path, MAY_SET, shots=2)
+    first, second = done.shots
+    assert first.readings["leader.go"] == ["good"]
+    assert first.readings["leader.answer"] == ["refused"] * len(BAD) + ["ready"]
+    assert (first.target.n_atoms, second.target.n_atoms) == (9 * 15, 15 * 15)
+    assert (len(first.cycles), first.parameters["target.rows"]) == (1, 9)
+    assert second.parameters["target.rows"] == 15, "values are for one shot"
+    for answer, shot in zip(answers[-2:], done.shots, strict=True):
+        assert answer.facts["defects"] == shot.target.n_defects(shot.occupancies[-1])
+        assert answer.filling == pytest.approx(shot.filling_fraction)
+        assert shot.row.images.n_defects[-1] == answer.facts["defects"]
+
+
+def test_values_are_for_sequences_that_allow_them(tmp_path: Path) -> None:
+    said: list[str] = []
+
+    def lead(address: str) -> None:
+        peer = TcpPeer(address, f"{token_file().read_text().strip()} version=3")
+        peer.hear()
+        for line in ("go target.rows=3", '{"go": "a", "values": {"x": 1, "x": 2}}', '{"go": 3', '{"set": 1}'):
+            peer.say(line)
+            said.append(peer.hear())
+            if said[-1] == "busy":
+                said.append(peer.hear())
+        said.append(peer.ask("done"))
+        peer.ask("go")
+        peer.hear()
+        peer.leave()
+
+    run_led(lead, tmp_path, "shot.2.rearrange.cycles=1", shots=1)
+    hint = "write 'leader: {may_set: [target.rows]}' in it"
+    assert said[0] == "busy"
+    assert said[1].startswith("failed shot=0 ")
+    assert f" refused=1 reason=the sequence does not let the leader set 'target.rows'; {hint}" in said[1]
+    assert said[2:4] == ["busy", "failed refused=1 reason='x' is given twice"]
+    assert said[4] == "busy"
+    assert said[5].startswith("failed refused=1 reason=this is not JSON")
+    assert said[6].startswith('error expected {"go": TEXT')
+    assert said[7] == "error 'done' answers nothing that labseq has asked for"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["leader={may_set: [shots]}"], "a leader cannot set 'shots'; expected an address in 'planner'"),
+        (["leader={may_set: [shot.sort.cycles]}"], "'shot' has no item 'sort'"),
+        (["leader={may_set: []}"], "may_set"),
+        (
+            [MAY_SET, "shots=2", "scan={planner.degree_of_parallelism: [3, 5]}"],
+            "the sequence has a scan, and a leader",
+        ),
+    ],
+)
+def test_what_a_leader_cannot_set_is_reported_with_its_place(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        Session.open(FOLLOW, overrides=overrides)
+
+
+WAIT, TURN = "{wait: {for: go, timeout: 60 s}}", "{leader: {step: science, timeout: 20 s}}"
+SCIENCE = f"shot=[{WAIT}, {{image: {{}}}}, {TURN}, {{image: {{}}}}]"
+ASKED = "profile.devices.leader.light=asked"
+
+
+def test_the_leader_switches_its_light_sees_each_image_and_does_its_science(tmp_path: Path) -> None:
+    done_by_leader: list[Any] = []
+
+    def lead(address: str) -> None:
+        with Leader(port=int(address.rpartition(":")[2]), timeout_s=MAX_WAIT_S, each_image=True) as labseq:
+            labseq.go()
+
+            def see(image: Image) -> None:
+                done_by_leader.append((image.name, int(image.occupancy.sum())))
+
+            answer = labseq.wait(MAX_WAIT_S, see, done_by_leader.append, done_by_leader.append)
+            assert answer.is_ready
+
+    (shot,) = run_led(lead, tmp_path, SCIENCE, ASKED, shots=1).shots
+    n_before, n_after = (int(seen.sum()) for seen in shot.occupancies)
+    image = [("step_1_image", n_before), ("step_3_image", n_after)]
+    # the light is turned off while labseq detects; the image may be known before that is answered
+    assert [one for one in done_by_leader if not isinstance(one, float)] == [image[0], "science", image[1]]
+    assert [one for one in done_by_leader if isinstance(one, float)] == [0.045, 0.0, 0.045, 0.0]
+    assert shot.readings["leader.science"] == [""]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "reason"),
+    [
+        (["shot.2.leader.timeout=50 ms"], "its step 'science' is not done"),
+        (
+            ["profile.devices.leader.light=asked", "profile.devices.leader.light_timeout=50 ms"],
+            "light is not on",
+        ),
+    ],
+    ids=["step", "light"],
+)
+def test_a_leader_that_does_not_reply_fails_the_shot(
+    overrides: list[str], reason: str, tmp_path: Path
+) -> None:
+    said: list[str] = []
+
+    def lead(address: str) -> None:
+        peer = TcpPeer(address, f"{token_file().read_text().strip()} version=3")
+        peer.say("go")
+        while not said or said[-1]:
+            said.append(peer.hear())
+        peer.leave()
+
+    with pytest.raises(labseq.DeviceError, match=reason):
+        run_led(lead, tmp_path, SCIENCE, *overrides, "attempts=1", "policy.on_failure=stop")
+    assert any(line.startswith("failed shot=0") and reason in line for line in said)
+
+
+def test_a_dry_run_of_its_steps_and_its_light_needs_no_leader(tmp_path: Path) -> None:
+    changes = [SCIENCE, ASKED]
+    with Session.open(FOLLOW, dry_run="full", shots=1, seed=1, output=tmp_path, overrides=changes) as session:
+        assert not [one for one in check(session).warnings if "deadline" in str(one)]
+        assert session.run().shots[0].readings["leader.answer"] == ["ready"]
+
+
+def test_a_leader_may_only_listen(tmp_path: Path) -> None:
+    answers: list[Answer] = []
+
+    def listen(address: str) -> None:
+        with Leader(port=int(address.rpartition(":")[2]), timeout_s=MAX_WAIT_S, all_shots=True) as labseq:
+            answers.append(labseq.wait(MAX_WAIT_S))
+
+    done = run_led(listen, tmp_path, "shot.0={load: {duration: 2 s}}", "shot.2.rearrange.cycles=1", shots=1)
+    assert (answers[0].is_ready, answers[0].file) == (True, str(done.shots[0].file))
+    np.testing.assert_array_equal(answers[0].after, done.shots[0].occupancies[-1])
+
+
+def test_python_asks_for_shots_one_by_one(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"shots": 3, "seed": 1, "output": tmp_path, "overrides": [MAY_SET]}
+    with Session.open("compact_225", **options) as session:
+        results = [session.shot({"target.rows": rows, "shot.2.rearrange.cycles": 2}) for rows in (9, 12)]
+        with pytest.raises(ConfigError, match="target is 40 rows"):
+            session.shot({"target.rows": 40})
+        results.append(session.shot())
+        with pytest.raises(ConfigError, match="has taken all its shots"):
+            session.shot()
+        assert session.run_dir is not None
+    done = labseq.open_run(session.run_dir)
+    assert done.status == "complete"
+    for result, shot in zip(results, done.shots, strict=True):
+        np.testing.assert_array_equal(result.occupancies, shot.occupancies)
+        assert (result.index, result.file, result.success) == (shot.index, shot.file, shot.success)
+        assert result.defects[-1] == shot.target.n_defects(shot.occupancies[-1])
+    assert [shot.target.n_atoms for shot in done.shots] == [135, 180, 225]
+    with Session.open("compact_225", output=tmp_path) as session, pytest.raises(ConfigError, match="may_set"):
+        session.shot({"target.rows": 3})
+
+
+def test_a_served_run_is_led_until_the_block_ends(tmp_path: Path) -> None:
+    with labseq.serve(FOLLOW, seed=1, output=tmp_path, overrides=[ANY_PORT, PATIENT]) as served:
+        client = leader(served.address)
+        client.go()
+        assert client.wait(MAX_WAIT_S).is_ready
+        client.close()
+    host, _, port = served.address.rpartition(":")
+    with pytest.raises(ConnectionError):
+        socket.create_connection((host, int(port)))
+    done = labseq.open_run(served.run_dir)
+    assert (done.status, len(done.shots)) == ("stopped", 1)
+    alone = labseq.serve("compact_225", output=tmp_path)
+    with pytest.raises(ConfigError, match="no device of the profile has an address"), alone:
+        pass
