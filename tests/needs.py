@@ -53,6 +53,7 @@ def _compiles(compiler: str, suffix: str, header: str) -> bool:
 
 NEEDS = {
     "pypylon": _package("pypylon"),
+    "pylablib": _package("pylablib"),
     "hdf5plugin": _package("hdf5plugin"),
     "nidaqmx": _package("nidaqmx"),
     "pyarrow": _package("pyarrow"),

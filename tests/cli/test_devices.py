@@ -194,7 +194,7 @@ def test_a_profile_with_an_error_ends_with_its_place(call: Any) -> None:
 MOBILE, SHUTTER, CAMERA, STATIC = (
     f"{device:<20} safe" for device in ("mobile_tweezers", "shutter", "camera", "static_tweezers")
 )
-CAMERAS = "'andor', 'frames', 'genicam', 'pylon', 'remote', 'virtual'"
+CAMERAS = "'andor', 'frames', 'genicam', 'pylablib', 'pylon', 'remote', 'virtual'"
 NO_CAMERA = f"camera               NOT SAFE: p.yaml:4:15: unknown camera 'ixon'; expected one of {CAMERAS}"
 JAM = "shutter              NOT SAFE: shutter: safe_state() raised OSError: jammed (shutters.py)"
 TO_IXON = {"camera: {use: virtual": "camera: {use: ixon"}

@@ -13,6 +13,8 @@ from labseq_andor.camera import AndorCamera
 from labseq_andor.settings import AndorSettings
 from labseq_genicam.camera import GenicamCamera
 from labseq_genicam.settings import GenicamSettings
+from labseq_pylablib.camera import PylablibCamera
+from labseq_pylablib.settings import PylablibSettings
 from labseq_pylon.camera import PylonCamera
 from labseq_pylon.settings import PylonSettings
 from numpy.typing import NDArray
@@ -26,11 +28,15 @@ from labseq.testing.fakes import Calls, FakeClock, RecordingSimulation
 DRIVERS: dict[str, tuple[Any, Any]] = {
     "andor": (AndorCamera, AndorSettings),
     "genicam": (GenicamCamera, GenicamSettings),
+    "pylablib": (PylablibCamera, PylablibSettings),
     "pylon": (PylonCamera, PylonSettings),
 }
 """Driver and settings."""
 
-NEEDED = {"genicam": "libaravis", "pylon": "pypylon"}
+REQUIRED: dict[str, dict[str, Any]] = {"pylablib": {"interface": "dcam"}}
+"""Settings without which a driver has no settings."""
+
+NEEDED = {"genicam": "libaravis", "pylablib": "pylablib", "pylon": "pypylon"}
 """What the simulator of a camera needs beyond the group ``test``."""
 
 
@@ -79,12 +85,18 @@ class Rig:
         lines = (LineSpec("shutter", 0, ("image",), triggers="camera"),) if is_wired else ()
         context = Context("camera", SiteGrid(), clock=self.clock, simulation=self.world, lines=lines)
         given = settings if camera is None else {"camera": camera, "arming_time": "0 s", **settings}
+        given = REQUIRED.get(driver, {}) | given
         self.camera: Any = make(model.model_validate(given), context)
 
     @property
     def sim(self) -> Any:
         """The simulated Andor camera."""
         return self.camera.connection.camera
+
+    @property
+    def dcam(self) -> Any:
+        """The simulated DCAM camera."""
+        return self.camera.connection.simulated
 
     @property
     def genicam(self) -> Any:
