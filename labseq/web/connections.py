@@ -5,13 +5,15 @@ uvicorn reads headers of any length for any time, and counts idle connections as
 
 from __future__ import annotations
 
+import ssl
 import time
-from asyncio import TimerHandle, Transport
+from asyncio import Task, TimerHandle, Transport
 from collections import Counter
 from operator import attrgetter
 from typing import Any, Final
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.utils import get_remote_addr
 
 MAX_HEADERS: Final = 16 << 10
 """Largest request line with all headers, in bytes."""
@@ -31,10 +33,18 @@ class LimitedProtocol(HttpToolsProtocol):
     Attributes:
         since_s: When it was made.
         is_idle: Whether it has no request in progress; one whose headers are coming is none.
+
+    Args:
+        *args: Those of uvicorn.
+        tls: Certificate and key; None without TLS. uvicorn would tell of a connection after the handshake.
+        **named: Those of uvicorn.
     """
 
-    def __init__(self, *args: Any, **named: Any) -> None:
+    def __init__(self, *args: Any, tls: ssl.SSLContext | None = None, **named: Any) -> None:
         super().__init__(*args, **named)
+        self._tls = tls
+        self._handshake: Task[None] | None = None
+        self._early: list[bytes] = []  # what came with the end of the handshake
         self.since_s: float = time.monotonic()
         self.is_idle = True
         self._n_bytes = 0  # of the request that is coming
@@ -48,13 +58,37 @@ class LimitedProtocol(HttpToolsProtocol):
 
     def connection_made(self, transport: Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Count the connection, and close another one if there are too many."""
-        super().connection_made(transport)
         self._late = self.loop.call_later(REQUEST_S, transport.abort)
+        if self._tls is None:
+            super().connection_made(transport)
+        else:
+            transport.pause_reading()  # the handshake is not for the parser of requests
+            self.transport, self.client = transport, get_remote_addr(transport)
+            self.connections.add(self)
+            self._handshake = self.loop.create_task(self._agree(transport, self._tls))
         peers = [peer for peer in self.connections if isinstance(peer, LimitedProtocol)]
         idle = sorted((peer for peer in peers if peer.is_idle), key=attrgetter("since_s"))
         ((address, most),) = Counter(peer.address for peer in idle).most_common(1)
         if most > MAX_IDLE_OF_ADDRESS or len(idle) > MAX_IDLE:
-            next(peer for peer in idle if peer.address == address).transport.abort()
+            oldest = next(peer for peer in idle if peer.address == address)
+            self.connections.discard(oldest)  # now: a burst of connections would close the same one again
+            oldest.transport.abort()
+
+    async def _agree(self, transport: Transport, tls: ssl.SSLContext) -> None:
+        """Do the handshake of TLS, then read requests."""
+        try:
+            encrypted = await self.loop.start_tls(transport, self, tls, server_side=True)
+        except OSError as error:  # of ssl, or the connection has ended
+            transport.abort()
+            self.connection_lost(error)
+            return
+        if encrypted is None or transport.is_closing():
+            self.connection_lost(ConnectionAbortedError())
+            return
+        super().connection_made(encrypted)
+        self._handshake, early = None, self._early
+        for data in early:
+            self.data_received(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the connection."""
@@ -63,6 +97,9 @@ class LimitedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Read on, unless the request is too long."""
+        if self._handshake is not None:
+            self._early.append(data)
+            return
         if self._late is None:
             self._late = self.loop.call_later(REQUEST_S, self.transport.abort)
         self._n_bytes += len(data)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -12,6 +13,7 @@ import time
 import urllib.request
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -73,9 +75,7 @@ def serve(data: Path | None, serving: Serving) -> None:
     root = (data or data_root()).expanduser().absolute()
     if data is not None and not root.is_dir():
         raise ConfigError(Problem("there is no such folder", visible(str(root)), expected="a data folder"))
-    for path in (serving.certificate, serving.key):
-        if path is not None and not path.is_file():
-            raise ConfigError(Problem("there is no such file", visible(str(path)), expected="a PEM file"))
+    tls = _tls(serving.certificate, serving.key)
     notices = NoticeSettings.read(root)
     limits = Limits(serving.calibration_age_s, FREE_GB if notices is None else notices.free_gb)
     is_open = is_loopback(serving.host) and not serving.names
@@ -87,7 +87,9 @@ def serve(data: Path | None, serving: Serving) -> None:
         say(line)
     config = uvicorn.Config(
         app,  # pyright: ignore[reportArgumentType]
-        http=LimitedProtocol,
+        # uvloop reads from a new connection although it is paused, and the handshake would lose its beginning
+        loop="auto" if tls is None else "asyncio",
+        http=partial(LimitedProtocol, tls=tls),  # pyright: ignore[reportArgumentType]
         log_level="critical",  # errors are in the answers
         access_log=False,
         server_header=False,
@@ -96,8 +98,6 @@ def serve(data: Path | None, serving: Serving) -> None:
         limit_concurrency=400,
         timeout_keep_alive=20,
         timeout_graceful_shutdown=1,
-        ssl_certfile=serving.certificate,
-        ssl_keyfile=serving.key,
     )
     server = uvicorn.Server(config)
     if serving.ends_with is not None:
@@ -119,6 +119,27 @@ def check_packages() -> None:
         if find_spec(module) is None:
             what = f"showing runs in a browser needs {name}, which is not installed"
             raise ConfigError(Problem(what, hint=install_hint("web")))
+
+
+def _tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
+    """The certificate and its key; None without a certificate.
+
+    Raises:
+        ConfigError: A file is missing, or is not what it should be.
+    """
+    for path in (certificate, key):
+        if path is not None and not path.is_file():
+            raise ConfigError(Problem("there is no such file", visible(str(path)), expected="a PEM file"))
+    if certificate is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(certificate, key)
+    except OSError as error:
+        what = f"it cannot be used: {error.strerror or error}"
+        expected = "a PEM file with the certificate, and its key there or in --key"
+        raise ConfigError(Problem(what, visible(str(certificate)), expected=expected)) from error
+    return context
 
 
 def _listener(host: str, port: int) -> socket.socket:

@@ -250,6 +250,7 @@ def test_token_is_made_once_and_only_for_this_user(tmp_path: Path, monkeypatch: 
     [
         ({"host": "no such host.invalid"}, "cannot be used"),
         ({"certificate": Path("none.pem")}, "no such file"),
+        ({"certificate": Path(__file__)}, "expected a PEM file"),
     ],
 )
 def test_mistakes_are_reported(how: dict[str, Any], what: str, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import ssl
 import subprocess
 import sys
 import time
@@ -23,17 +24,23 @@ from labseq.cli import main
 sys.argv[0] = "labseq"
 main()
 """
+PEM = Path(__file__).with_name("localhost.pem")
+"""A certificate for 127.0.0.1 with its key, which is no secret."""
+TLS = ssl.create_default_context(cafile=PEM)
 
 
 @contextmanager
-def server(data: Path, request_s: float = 60.0) -> Generator[tuple[psutil.Process, str]]:
+def server(
+    data: Path, request_s: float = 60.0, *, tls: bool = False
+) -> Generator[tuple[psutil.Process, str]]:
     """A server in a process of its own, and its address."""
     command = [sys.executable, "-c", SERVE, str(request_s), "web", str(data), "--port", "0"]
+    command += ["--cert", str(PEM)] if tls else []
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             address = process.stdout.readline().strip()
-            with urlopen(f"{address}api/v1/server", timeout=60.0):
+            with urlopen(f"{address}api/v1/server", timeout=60.0, context=TLS):
                 yield psutil.Process(process.pid), address
         finally:
             process.terminate()
@@ -79,12 +86,19 @@ def test_headers_without_an_end_are_not_kept(running: tuple[psutil.Process, str]
     assert process.memory_info().rss < before + (32 << 20)
 
 
-def test_idle_connections_keep_nobody_out(running: tuple[psutil.Process, str]) -> None:
-    _, address = running
+@pytest.fixture(scope="module")
+def encrypted(tmp_path_factory: pytest.TempPathFactory) -> Generator[tuple[psutil.Process, str]]:
+    with server(tmp_path_factory.mktemp("data"), tls=True) as one:
+        yield one
+
+
+@pytest.mark.parametrize("name", ["running", "encrypted"])
+def test_idle_connections_keep_nobody_out(name: str, request: pytest.FixtureRequest) -> None:
+    _, address = request.getfixturevalue(name)
     idle = [connected(address) for _ in range(450)]
     try:
         begun_s = time.monotonic()
-        with urlopen(f"{address}api/v1/server", timeout=60.0) as answer:
+        with urlopen(f"{address}api/v1/server", timeout=60.0, context=TLS) as answer:
             assert answer.status == 200
         assert time.monotonic() < begun_s + 10.0  # it was 40 s
         assert is_closed(idle[0])
@@ -93,8 +107,13 @@ def test_idle_connections_keep_nobody_out(running: tuple[psutil.Process, str]) -
             peer.close()
 
 
-@pytest.mark.parametrize("begin", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nhost: 127.0.0.1\r\n"])
-def test_a_request_that_does_not_end_is_not_waited_for(tmp_path: Path, begin: bytes) -> None:
-    with server(tmp_path, request_s=0.3) as (_, address), connected(address) as peer:
-        peer.sendall(begin)
-        assert is_closed(peer)
+@pytest.mark.parametrize("tls", [False, True])
+def test_a_request_that_does_not_end_is_not_waited_for(tmp_path: Path, tls: bool) -> None:
+    begins = (b"", b"GET / HT", b"GET / HTTP/1.1\r\nhost: 127.0.0.1\r\n", b"\x16\x03\x01")
+    with server(tmp_path, 1.0, tls=tls) as (_, address):
+        peers = [connected(address) for _ in begins]
+        for peer, begin in zip(peers, begins, strict=True):
+            peer.sendall(begin)
+        assert all(map(is_closed, peers))
+        for peer in peers:
+            peer.close()
