@@ -45,7 +45,7 @@ class Picture:
 
 _KAGOME = 'labseq plan random:10x10@0.75 --seed 4 --target "{pattern: kagome, rows: 7, cols: 7}"'
 _COMPACT = 'labseq plan random:20x20@0.75 --seed 1 --target "{pattern: compact, rows: 15, cols: 15}"'
-_SCAN = "labseq run sequences/scan_dop.yaml --seed 1 --set repeats=50 --set record_frames=all"
+_SCAN = "labseq run scan_dop --seed 1 --set repeats=50 --set record_frames=all"
 _KINDS = ("tweezers", "sites", "thresholds", "frequencies", "overlay")
 _MORNING = tuple(f"labseq calibrate {kind} --profile practice --seed 1" for kind in _KINDS)
 
