@@ -23,12 +23,13 @@ import typer
 import labseq
 from labseq import builtin
 from labseq.cli.app import app
+from labseq.data.shot import Shot
 from labseq.errors import LabseqError, Problem
 from labseq.model.policies import StepPolicy
 from labseq.plugins.host import ENTRY_POINT_GROUP, PluginHost
 from labseq.registry import Registry
 from labseq.roles import ROLES
-from labseq.scaffold import reference
+from labseq.scaffold import python_reference, reference
 from labseq.scaffold.reference import Block, Code, Definition, Table, definition, docstring, summary
 from labseq.settings import models_at
 from labseq.testing import SUITES, fakes, strategies
@@ -39,34 +40,6 @@ PART: Final = re.compile(r"<!-- reference: (.+?) -->")
 """The place of a generated part on a page: the part's name and arguments."""
 PROGRAM: Final[Any] = typer.main.get_command(app)
 
-_SCRIPTS: Final = (
-    "open_run",
-    "Session.open",
-    "Session.resume",
-    "Run.select",
-    "Run.fit",
-    "Run.fits",
-    "make_planner",
-    "make_target",
-    "check_plan",
-    "tone_program",
-    "render",
-    "as_occupancy",
-)
-"""What a script or a notebook calls."""
-_ALIASES: Final = {
-    "FilePath": "a path in a settings model, relative to the file that holds it",
-    "LABSEQ_API": "version of the interface that plugins are written for",
-    "Occupancy": "a boolean array (rows, columns): which sites hold an atom",
-    "RfSpan": "`RfSamples` or `RfTones`",
-    "Trigger": "how an exposure starts: `internal`, `software` or `external`",
-    "hookimpl": "marks a function as the implementation of a hook",
-    **dict.fromkeys(
-        ("Angle", "Duration", "Fraction", "Frequency", "Length", "Speed", "Temperature", "Voltage"),
-        "a quantity in a settings model: with a unit in the file, SI inside",
-    ),
-}
-"""Names whose docstring is not their own."""
 _GIVEN: Final = {"self", "device", "shape", "seed", "kind", "duration_s"}
 """Arguments of what a plugin's test may override; methods with others serve the suite itself."""
 
@@ -174,32 +147,13 @@ def strategy_list() -> list[Block]:
 
 def fake_list() -> list[Block]:
     """A row per fake."""
-    return [_summaries("name", {name: getattr(fakes, name) for name in fakes.__all__})]
+    return [python_reference.summaries("name", {name: getattr(fakes, name) for name in fakes.__all__})]
 
 
-def scripts() -> list[Block]:
-    """A definition for each function that scripts call."""
-    return [definition(_find(name), name=f"labseq.{name}") for name in _SCRIPTS]
-
-
-def names() -> list[Block]:
-    """All public names in a table."""
-    public = sorted(name for names in vars(labseq)["_HOMES"].values() for name in names)
-    return [_summaries("`labseq.`", {name: _find(name) for name in public})]
-
-
-def _summaries(title: str, found: Mapping[str, Any]) -> Table:
-    rows = [
-        (f"`{name}`", _ALIASES.get(name) or summary(one).removesuffix(".")) for name, one in found.items()
-    ]
-    return Table((title, "what it is"), rows)
-
-
-def _find(name: str) -> Any:
-    found: Any = labseq
-    for part in name.split("."):
-        found = getattr(found, part)
-    return found
+def class_members(name: str) -> list[Block]:
+    """A public class of labseq, with its attributes and methods."""
+    kind = Shot if name == "Shot" else getattr(labseq, name)
+    return python_reference.class_reference(kind)
 
 
 def source(path: str, name: str = "") -> list[Block]:
@@ -268,9 +222,11 @@ PARTS: Final[Mapping[str, Callable[..., list[Block]]]] = {
     "contract": contract,
     "strategies": strategy_list,
     "fakes": fake_list,
-    "scripts": scripts,
-    "names": names,
+    "class": class_members,
+    "scripts": python_reference.scripts,
+    "names": python_reference.names,
     "source": source,
+    "environment": reference.environment,
     "units": reference.units,
     "registry": registry_methods,
     "hooks": reference.hooks,

@@ -40,20 +40,17 @@ class RenderedProgram:
     Attributes:
         gigasamples_per_s: Samples of both channels per second, in 1e9.
         playing_over_rendering: Its playing time over the time of rendering it.
-        goal: Minimum that this ratio should have.
     """
 
     name: str
     gigasamples_per_s: float
     playing_over_rendering: float
-    goal: float
 
 
 PROGRAMS: Final[Sequence[Column[RenderedProgram]]] = (
     Column("two channels", lambda program: program.name),
     Column("Gsample/s", lambda program: f"{program.gigasamples_per_s:.3g}", right=True),
     Column("playing/rendering", lambda program: f"{program.playing_over_rendering:.3g}", right=True),
-    Column("goal", lambda program: f">= {program.goal:g}", right=True),
 )
 
 
@@ -68,7 +65,12 @@ class RenderingReport:
     def as_text(self) -> list[str]:
         """A table of the measurements, and their extent."""
         rate = format_quantity(self.sample_rate_hz, "frequency")
-        return [*table(self.rows, PROGRAMS), "", f"{rate}, two threads; the best of {self.repeats}"]
+        return [
+            *table(self.rows, PROGRAMS),
+            "",
+            f"{rate}, two threads; the best of {self.repeats}",
+            "above 1 the computer renders faster than the card plays",
+        ]
 
 
 def bench_waveform(
@@ -97,13 +99,13 @@ def _rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[Render
     motion = replace(moves.motion, overhead_per_batch_s=0.0)
     plan = tone_program(moves.plan, grid, motion)
     jerk = uniform_program(grid, 7, (1,), FrequencyCourse.MINIMUM_JERK)
-    for name, program, goal in (
-        ("1 group, 5 tones", uniform_program(grid, 5, (1,)), 3.0),
-        ("1 group, 20 tones", uniform_program(grid, 20, (1,)), 3.0),
-        ("3 groups, 7 tones", uniform_program(grid, 7, (1, 0, -1)), 2.0),
-        ("3 groups, 20 tones", uniform_program(grid, 20, (1, 0, -1)), 2.0),
-        ("minimum jerk, 7 tones", jerk, 1.0),
-        ("plan 20 -> 15 at 7, pauses left out", plan, 2.5),
+    for name, program in (
+        ("1 group, 5 tones", uniform_program(grid, 5, (1,))),
+        ("1 group, 20 tones", uniform_program(grid, 20, (1,))),
+        ("3 groups, 7 tones", uniform_program(grid, 7, (1, 0, -1))),
+        ("3 groups, 20 tones", uniform_program(grid, 20, (1, 0, -1))),
+        ("minimum jerk, 7 tones", jerk),
+        ("plan 20 -> 15 at 7, pauses left out", plan),
     ):
         renderer = Renderer(program, rate_hz)
         # the fastest: other work on the computer only makes it slower
@@ -112,7 +114,6 @@ def _rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[Render
             name=name,
             gigasamples_per_s=N_CHANNELS * renderer.n_samples / taken_s / 1e9,
             playing_over_rendering=renderer.n_samples / rate_hz / taken_s,
-            goal=goal,
         )
 
 

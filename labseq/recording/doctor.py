@@ -257,9 +257,11 @@ class _Check:
     def check_data_folder(self, stale: list[Marker]) -> None:
         """Check for leftovers in a data folder next to its runs."""
         for marker in stale:
+            # that of a run in another folder, often of another user, says nothing about this one
+            if marker.run_dir is None or not marker.run_dir.is_relative_to(self.folder.resolve()):
+                continue
             advice = f"'labseq safe {marker.profile or 'PROFILE'}', or the next run on it, makes it safe"
-            where = marker.run_dir or marker.path
-            self._add("a run died without making its hardware safe", where, f"left: {advice}")
+            self._add("a run died without making its hardware safe", marker.run_dir, f"left: {advice}")
         days = [self.folder / name for name in names_in(self.folder) if not name.startswith(".")]
         for folder in (self.folder, *days):
             with suppress(RecordingError):  # reported where its runs are looked for

@@ -1,4 +1,4 @@
-"""The words that commands print, for `labseq explain`: heads of columns, names of rows, stages, outcomes.
+"""The words that commands print, for `labseq explain`, and the environment variables.
 
 A test collects the words from the code that prints them. Those that are keys of files, quantities or kinds of
 plugin are explained there.
@@ -149,7 +149,6 @@ COLUMNS: Final[Mapping[str, str]] = {
     "two channels": "what is rendered, for both channels of the AWG",
     "Gsample/s": "samples rendered per second, in thousand millions",
     "playing/rendering": "time of playing the samples over that of rendering them",
-    "goal": "what the figure must reach",
     "attempts": "how often a shot is tried",
     "device call": "longest time that a call of a device may take",
     "not opened": "devices that the check has not opened",
@@ -161,3 +160,20 @@ COLUMNS: Final[Mapping[str, str]] = {
     "measures": "what the run measures, with the model of its fit",
 }
 """Heads of columns and names of rows -> their meaning."""
+
+ENVIRONMENT: Final[Mapping[str, str]] = {
+    "LABSEQ_DATA": "Folder for the data, if `--output` does not name one. If it is not set: `./data`.",
+    "LABSEQ_CAMPAIGN_KEYS": "Folder of the certificates of a cluster, if `--keys` does not name one.",
+    "LABSEQ_PLUGIN_PATH": "Folders with plugins, separated as in PATH.",
+    "LABSEQ_KEYS": "Folder of the keys of this computer and of the computers that it knows. If it is not "
+    "set: `keys` in the user's folder for configurations.",
+    "LABSEQ_LOCKS": "Folder of the locks of devices and the markers of runs in progress, for all users of "
+    "the computer. If it is not set: `/var/tmp/labseq`, on Windows `labseq` in `%PROGRAMDATA%`.",
+    "LABSEQ_STATE": "Folder for the state that labseq keeps between commands. If it is not set: "
+    "`$XDG_STATE_HOME/labseq` or `~/.local/state/labseq` on Linux, `~/Library/Application Support/labseq` on "
+    "macOS, `%LOCALAPPDATA%/labseq/State` on Windows.",
+    "LABSEQ_WEB_TOKEN": "Token that `labseq web` asks for, at least 16 characters. If it is not set: that in "
+    "the file `web.token` in the folder for the state.",
+    "LABSEQ_CACHE": "Folder for compiled kernels. If it is not set: a folder in the user's cache.",
+}
+"""Environment variables that labseq reads, and what they set."""

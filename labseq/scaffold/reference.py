@@ -31,7 +31,7 @@ from labseq.messages import clean, closest
 from labseq.model.policies import StepPolicy
 from labseq.registry import Entry, Registry
 from labseq.roles import EVENTS, ROLES
-from labseq.scaffold.printed import COLUMNS, OUTCOMES, STAGES
+from labseq.scaffold.printed import COLUMNS, ENVIRONMENT, OUTCOMES, STAGES
 from labseq.scaffold.words import default_of, docstring, summary, value_of
 from labseq.settings import Choice, Setting, SettingsType, has_settings, models_at, settings_of
 from labseq.units import EXAMPLES, UNITS, unit_names
@@ -302,6 +302,11 @@ def events() -> list[Block]:
     return [_named("event", EVENTS)]
 
 
+def environment() -> list[Block]:
+    """A row per environment variable."""
+    return [_named("name", ENVIRONMENT)]
+
+
 def _named(title: str, rows: Mapping[str, str]) -> Table:
     return Table((title, "meaning"), [(f"`{name}`", about) for name, about in rows.items()])
 
@@ -437,6 +442,7 @@ _TABLES: Final[Mapping[str, tuple[str, Callable[[], list[Block]]]]] = {
     "rule": ("rules that every plan is checked against", plan_rules),
     "exit": ("exit codes of the commands", exit_codes),
     "fit": ("models for the points of a scan", fits),
+    "variable": ("environment variables", environment),
     "word": ("words that the commands print: heads of columns, names of rows, stages", words),
 }
 """First word of topics -> what they are, and a table with a row for each of them."""
@@ -483,7 +489,14 @@ def topics(registry: Registry, program: Any) -> dict[str, Topic]:
             if key.startswith(f"{name} ")
         }
         by_name[name] = Topic(about, partial(_blocks, _named, name, rows))
-    return by_name | core_topics | {"hook": Topic("functions of a plugin that labseq calls", hooks)}
+    from labseq.scaffold.python_reference import python_topics
+
+    return (
+        by_name
+        | core_topics
+        | python_topics()
+        | {"hook": Topic("functions of a plugin that labseq calls", hooks)}
+    )
 
 
 def _blocks(make: Callable[..., Block], *arguments: Any, **options: Any) -> list[Block]:

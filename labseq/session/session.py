@@ -183,8 +183,7 @@ class Shots:
 class Session(PreparedRun):
     """Opens a sequence, runs it, and leaves every device safe; a context manager.
 
-    Example::
-
+    Example:
         with labseq.Session.open("sequences/compact_225.yaml", shots=5) as session:
             run = session.run()
     """

@@ -14,7 +14,7 @@ from labseq.motion.rendering import Renderer, RenderPath
 GRID = SiteGrid()
 
 
-def test_a_table_with_all_goals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_and_its_rows_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "waveform.json"
     with pytest.raises(SystemExit, match=r"^0$"):
         main(["bench", "waveform", "--repeats", "1", "--json", str(path)])
@@ -23,7 +23,6 @@ def test_a_table_with_all_goals(tmp_path: Path, capsys: pytest.CaptureFixture[st
     _, *lines = table.splitlines()
     assert [line.split("  ")[0] for line in lines] == [row["name"] for row in rows]
     assert all(row["gigasamples_per_s"] > 0 and row["playing_over_rendering"] > 0 for row in rows)
-    assert [line.split()[-1] for line in lines] == [f"{row['goal']:g}" for row in rows]
     assert "624 MHz" in extent
 
 

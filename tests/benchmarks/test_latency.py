@@ -1,7 +1,6 @@
 """What passes between a frame in memory and the first samples, part by part, called directly.
 
-``labseq bench latency`` measures the same as a run calls it. The goal: 2 ms from the frame to
-the first chunk.
+``labseq bench latency`` measures the same as a run calls it.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from labseq.model.policies import StepPolicy
 from labseq.plugin import simulation, system
 from labseq.registry import Registry
 from labseq.roles import ROLES
-from labseq.scaffold import reference
+from labseq.scaffold import python_reference, reference
 from labseq.scaffold.reference import Table, settings
 from labseq.settings import Choice, PatternChoice, SettingsType, settings_at, settings_of
 
@@ -99,12 +99,13 @@ def test_everything_is_on_a_page() -> None:
     found = {" ".join(("command", *names)) for names, _ in reference.commands_below(SCRIPT.PROGRAM)}
     found |= {f"role {name}" for name in reference.roles_by_name() if name in IN_PLUGIN}
     found |= {f"contract {kind}" for kind in (*testing.SUITES, "hardware")}
+    found |= {f"class {name}" for name in ("Session", "Run", "Shot")}
     found |= {f"plugins {kind}" for kind in ROLES if kind not in ("step", "pattern")}
     registry: Registry = SCRIPT.registry()
     found |= {f"settings {kind} {name}" for kind in ("step", "pattern") for name in registry.names(kind)}
     found |= {f"settings {kind} top" for kind in FILES} | {"settings sequence shot policy", "command"}
     # what takes arguments is there as often as it is needed
-    found |= SCRIPT.PARTS.keys() - {"command", "role", "contract", "plugins", "settings", "source"}
+    found |= SCRIPT.PARTS.keys() - {"command", "role", "contract", "plugins", "settings", "source", "class"}
     assert sorted(found - PARTS) == []
 
 
@@ -126,6 +127,18 @@ def test_every_topic_can_be_explained() -> None:
         is_table = [not isinstance(block, reference.Code) for block in topic.blocks()]
         assert all(is_table) <= (max(map(len, lines)) <= 80), name
         assert "`" not in "".join(lines), name
+
+
+def test_what_code_and_the_shell_name_can_be_explained() -> None:
+    topics = reference.topics(SCRIPT.registry(), SCRIPT.PROGRAM)
+    for name in ("PlannerContract", "open_run", "Session", "Run", "Shot", "LABSEQ_DATA"):
+        assert any(found.endswith(f" {name}") for found in reference.find(topics, name)), name
+    suites = {suite.__name__ for suite in testing.SUITES.values()}
+    assert suites <= {name.removeprefix("contract ") for name in topics}
+    *_, promises = python_reference.contract("PlannerContract")
+    *_, shown = SCRIPT.contract("planner")
+    assert isinstance(promises, Table)
+    assert {row[1] for row in promises.rows} == {row[0] for row in shown.rows}
 
 
 def printed_words() -> set[str]:
@@ -233,7 +246,7 @@ def snake_case(name: str) -> str:
 
 
 def test_every_public_name_says_what_it_is() -> None:
-    (table,) = SCRIPT.names()
+    table: Any = python_reference.names()[0]
     stub = (ROOT / "labseq" / "__init__.pyi").read_text("utf-8")
     names = sorted({*re.findall(r"\b(\w+) as \1\b", stub)} - {"plugin"})  # a module, on a page of its own
     assert [row[0].strip("`") for row in table.rows] == names
@@ -269,7 +282,7 @@ def test_every_error_exit_code_and_event_is_in_the_reference() -> None:
 
 
 def test_every_environment_variable_is_in_the_reference() -> None:
-    page = (ROOT / "docs" / "reference" / "cli.md").read_text("utf-8")
+    page = TEXTS[ROOT / "docs" / "reference" / "cli.md"]
     for name in {*re.findall(r'"(LABSEQ_[A-Z_]+)"', sources("labseq", "plugins"))} - {"LABSEQ_API"}:
         assert f"| `{name}` |" in page
 

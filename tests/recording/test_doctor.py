@@ -316,6 +316,8 @@ def test_marks_of_runs_that_left_hardware_unsafe_stay(run_dir: Path) -> None:
     assert found.left
     assert "'labseq safe lab'" in found.done
     assert found.where.exists()
+    (root / "elsewhere").mkdir()
+    assert examine(root / "elsewhere").findings == []  # a folder of another user is not to blame
 
 
 def test_claims_are_moved_away(run_dir: Path) -> None:

@@ -276,7 +276,7 @@ def same(target: TargetPattern) -> TargetPattern:
 PlannerFactory: TypeAlias = Callable[[Context], Planner]
 Check: TypeAlias = Callable[[TargetPattern, Occupancy], None]
 
-PASSES_THE_CHECK = "the plan passes labseq.check_plan at the planner's degree of parallelism"
+PASSES_THE_CHECK: Final = "the plan passes labseq.check_plan at the planner's degree of parallelism"
 
 
 class PlannerContract:
