@@ -52,9 +52,11 @@ class Image:
         """Which sites hold an atom: a list of rows of booleans, or an array if numpy is installed."""
         n_rows, n_cols = self._shape
         packed = bytes.fromhex(self.facts["occupancy"])
-        bits = [byte >> k & 1 == 1 for byte in packed for k in range(7, -1, -1)]
-        rows = [bits[row * n_cols : (row + 1) * n_cols] for row in range(n_rows)]
-        return rows if np is None else np.array(rows, dtype=bool)
+        if np is not None:
+            bits = np.unpackbits(np.frombuffer(packed, np.uint8))
+            return bits[: n_rows * n_cols].reshape(n_rows, n_cols).astype(bool)
+        each = [byte >> k & 1 == 1 for byte in packed for k in range(7, -1, -1)]
+        return [each[row * n_cols : (row + 1) * n_cols] for row in range(n_rows)]
 
 
 class Answer:

@@ -10,7 +10,6 @@ from pydantic import Field, model_validator
 from labseq.messages import format_plugin_error
 from labseq.plugin import (
     COMPUTER,
-    ConfigError,
     Device,
     Duration,
     Fraction,
@@ -28,7 +27,6 @@ from labseq.plugin import (
     format_quantity,
     setting_error,
 )
-from labseq.plugin.lines import find_leader
 
 
 class LoadSettings(Settings):
@@ -292,39 +290,10 @@ class WaitStep(Step):
             shot.record_duration(self.duration_s, self.duration_s)
 
 
-class FollowStep(Step):
-    """Waits for the start signal of another control system."""
-
-    notes = ()
-
-    def __init__(self, signal: str, timeout_s: float, device: str = "") -> None:
-        self.signal = signal
-        self.timeout_s = timeout_s
-        self.device = device
-
-    def check_devices(
-        self,
-        devices: Mapping[str, object],
-        context: StepContext,  # noqa: ARG002 - of the role
-    ) -> Mapping[str, str | Problem]:
-        """Find the device that receives the signal."""
-        try:
-            find_leader(devices, self.device)
-        except ConfigError as error:
-            return {"device" if self.device else "for": str(error)}
-        return {}
-
-    def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - of the role
-        """One entry, at most the timeout; the lines are idle, because the length of the wait is unknown."""
-        return [TimelineEntry(f"wait for {self.signal}", self.timeout_s, 0.0)]
-
-    def run(self, shot: Shot) -> None:
-        """Wait for the signal."""
-        shot.follow(self.signal, self.timeout_s, self.device)
-
-
-def wait_step(settings: WaitSettings) -> WaitStep | FollowStep:
+def wait_step(settings: WaitSettings) -> Step:
     """Waits for a time, or for the signal of an external control system."""
     if settings.signal is None or settings.timeout is None:
         return WaitStep(settings)
+    from labseq.builtin.follow import FollowStep  # most runs follow nobody
+
     return FollowStep(settings.signal, settings.timeout, settings.device or "")

@@ -18,6 +18,7 @@ VERSION: Final = 3
 SHORT_LINE: Final = 200
 """Longest first line in bytes of a control system, and longest answer of the short form."""
 LONGEST_REASON: Final = 1000
+_ENCODER: Final = json.JSONEncoder(allow_nan=False)
 
 
 class Form(Enum):
@@ -113,6 +114,8 @@ def facts_of(about: Mapping[str, Any], times: Times) -> dict[str, Any]:
         if images:
             facts["shape"] = list(images[-1].occupancy.shape)
             facts["atoms"], facts["defects"] = (facts["images"][-1][key] for key in ("atoms", "defects"))
+        if record.n_missing_atoms:
+            facts["missing"] = record.n_missing_atoms
         facts["steps"] = [
             {"name": step.name, "step": step.step, "start_s": _time(since_s + step.t_start_s)}
             | {"duration_s": _time(step.achieved_s)}
@@ -168,7 +171,7 @@ def line(form: Form, word: str, facts: Mapping[str, Any]) -> str:
     In text, facts follow as "key=value" in their order; "run" and "reason" come last, and may contain spaces.
     """
     if form is Form.JSON:
-        return json.dumps({"answer": word, **facts}, allow_nan=False)
+        return _ENCODER.encode({"answer": word, **facts})
     if form is Form.TEXT:
         facts = _flat(facts)
     else:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import pytest
 from hypothesis import given, strategies as st
+from labseq_follow.answers import Asked, Form
 from labseq_follow.leader import serial_leader, tcp_leader
 from labseq_follow.protocol import Dialogue, Splitter
 from labseq_follow.settings import SerialLeaderSettings, TcpLeaderSettings
@@ -220,33 +221,37 @@ def test_loading_needs_a_simulated_lab() -> None:
         tcp_leader(TcpLeaderSettings(loads=True), Context("leader"))
 
 
-EVENTS = st.lists(st.sampled_from(["go", "take", "report", "pass", "leave", "noise", "abort"]), max_size=40)
+SENT = ["go", "go x=1", '{"go": 1', "set x=1", "gog", "abort", "done"]
+EVENTS = st.lists(st.sampled_from([*SENT, "take", "report", "pass", "leave", "ask"]), max_size=40)
 
 
 @given(EVENTS)
 def test_each_go_gets_exactly_one_answer(events: list[str]) -> None:
     dialogue, now_s, n_go_signals, n_lost, said = Dialogue(1.0), 0.0, 0, 0, list[str]()
-    dialogue.connected("a leader")
+    dialogue.connected("a leader", Asked(Form.TEXT, each_image=True))
     for event in events:
         now_s += 1.5 if event == "pass" else 0.1
         said += dialogue.overdue(now_s)
         n_answers = sum(line.startswith(("ready", "failed")) for line in said)
-        if event == "go":
+        if "go" in event and event != "gog":
             n_go_signals += 1
-            said += dialogue.receive_line("go", now_s)
-        elif event == "noise":
-            said += dialogue.receive_line("gog", now_s)
-        elif event == "take":
-            dialogue.take(now_s)
-        elif event == "abort":
-            said += dialogue.receive_line("abort", now_s)
+            said += dialogue.receive_line(event, now_s)
+        elif event in ("gog", "abort", "set x=1"):
+            said += dialogue.receive_line(event, now_s)
+        elif event == "take" and dialogue.take(now_s) is not None:
+            dialogue.take_values()
+        elif event == "ask":
+            said += dialogue.request("your", {"step": "science"}, "done", now_s)
+        elif event == "done":
+            said += dialogue.receive_line("done", now_s)
+            dialogue.end_request(now_s)
         elif event == "report":
             said += dialogue.report("ready", {"shot": 0}, now_s)[1]
             assert not dialogue.is_aborted, "an abort is for one shot"
         elif event == "leave":
             n_lost += n_go_signals - n_lost - n_answers  # a leader that leaves gives up its answer
             dialogue.lost("it left")
-            dialogue.connected("another leader")
+            dialogue.connected("another leader", Asked(Form.TEXT))
     said += dialogue.end()
     assert sum(line.startswith(("ready", "failed")) for line in said) == n_go_signals - n_lost
 

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labseq.builtin.steps import FollowStep, WaitStep, wait_step
+from labseq.builtin.follow import FollowStep
+from labseq.builtin.steps import WaitStep, wait_step
 from labseq.errors import (
     ConfigError,
     DeviceError,
@@ -18,6 +19,7 @@ from labseq.errors import (
 from labseq.model import LineSpec, ShotRecord
 from labseq.roles import Context, StepContext
 from labseq.sequencer.leader import find_leader
+from labseq.sequencer.shot import ShotSettings
 from labseq.testing import StepContract
 from labseq.testing.contracts.step import Factory
 from labseq.testing.fakes import FakeLab, ListSink, RecordingDevice, RecordingLeader
@@ -36,6 +38,57 @@ class TestFollow(StepContract):
         leader = RecordingLeader(Context("leader", clock=lab.clock), lab.calls)
         object.__setattr__(lab, "devices", {"leader": leader})
         return lab
+
+
+class SpeakingLeader(RecordingLeader):
+    """A leader that sends values, and an image each."""
+
+    asks_for_light = True
+
+    def __init__(self, context: Context, calls: Any) -> None:
+        super().__init__(context, calls)
+        self.values: list[dict[str, str]] = []
+        self.told: list[Any] = []
+
+    def expect_values(self, check: Any) -> None:
+        self.check = check
+
+    def take_values(self) -> dict[str, str]:
+        return self.values.pop(0) if self.values else {}
+
+    def take_turn(self, step: str, timeout_s: float, shot: int) -> str:
+        raise DeviceTimeoutError(self.name, f"'{step}' of shot {shot} is not done", timeout_s)
+
+    def light_on(self, exposure_s: float, shot: int) -> None:
+        self.told.append((shot, exposure_s))
+
+    def light_off(self, shot: int) -> None:
+        self.told.append((shot, 0.0))
+
+    def report_image(self, about: Any) -> None:
+        self.told.append((about["shot"], about["image"].name))
+
+
+def test_an_edge_at_one_device_takes_the_values_that_another_one_has_sent() -> None:
+    made = rig(("wait", FollowStep("go", 10.0, "leader")), IMAGE)
+    speaking = SpeakingLeader(Context("artiq", clock=made.lab.clock), made.lab.calls)
+    object.__setattr__(made.lab, "devices", {**made.lab.devices, "artiq": speaking})
+    speaking.values = [{"x": "1"}, {"x": "many"}, {"x": "2"}]
+    sequencer = made.sequencer
+    base = ShotSettings(made.lab, sequencer._steps, sequencer._timelines, {"x": 0})
+
+    def settings_for(values: Any) -> ShotSettings:
+        if values.get("x") == "many":
+            raise ConfigError("x is 'many'")
+        return base._replace(parameters={"x": int(values.get("x", 0))})
+
+    sequencer._settings_for = settings_for
+    made.run(3)
+    assert [shot.parameters for shot in made.sink.shots] == [{"x": 1}, {"x": 2}, {"x": 0}]
+    assert states(made) == ["ready", "failed", "ready", "ready"], "a wrong value is no failure of the shot"
+    assert leader_of(made).answers[1][1] == {"shot": 1, "refused": True, "reason": "x is 'many'"}
+    image = "image"
+    assert speaking.told[:4] == [(0, 0.045), (0, 0.0), (0, image), (1, 0.045)], "light, dark, image"
 
 
 def rig(*steps: tuple[str, Any], goes_after_s: float = 0.5, attempts: int = 3, **lab: Any) -> Rig:
