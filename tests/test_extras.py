@@ -19,6 +19,7 @@ import pytest
 from labseq_frames.files import BadFramesError, load
 from labseq_nidaqmx.library import import_package
 from labseq_optuna.scanner import OptunaScanner, OptunaSettings
+from labseq_pylablib.library import DCAM, load as load_pylablib
 from labseq_pylon.library import load_pypylon
 
 import labseq.testing
@@ -59,6 +60,7 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("optuna", "optuna", "optuna"): lambda: OptunaScanner(OptunaSettings(), ScanSpace((), 1)),
     ("plot", "matplotlib", "matplotlib"): lambda: check_place(Path("a.png")),
     ("plot", "pillow", "PIL"): lambda: read_drawing(ROOT / "docs" / "_static" / "plan_kagome.png", "#"),
+    ("pylablib", "pylablib", "pylablib"): lambda: load_pylablib("camera", DCAM, ""),
     ("pylon", "pypylon", "pypylon.pylon"): lambda: load_pypylon("camera"),
     ("remote", "pyzmq", "zmq"): require_packages,
     ("remote", "msgpack", "msgpack"): require_packages,

@@ -3,6 +3,7 @@
 What only some plugins need is in modules by subject:
 
 - ``camera``: base class of camera drivers, their settings, cooling, a simulated sensor
+- ``camera_simulator``, ``sdk_camera``: what simulators of cameras, and drivers on a vendor's library, share
 - ``first_contact``: steps that prove what a driver assumes, and the file of what they measured
 - ``geometry``: sites of a grid: blocks, patterns, their order from the centre
 - ``leader``: settings, log and simulation of another control system that starts the shots
