@@ -146,13 +146,16 @@ def base_modules() -> set[str]:
     }
 
 
+OF_EXTRAS = {("labseq", "web"), ("labseq", "testing"), ("plugins", "labseq_bridges")}
+
+
 def test_a_module_imports_what_only_an_extra_has_when_it_needs_it() -> None:
-    """The pages and the support for tests are nothing without theirs, and are imported late themselves."""
-    plugins = {path.name for path in (ROOT / "plugins").iterdir()}
+    """The pages, the support for tests and the bridges are nothing without theirs, and are imported late."""
+    plugins = {path.stem for path in (ROOT / "plugins").iterdir()}
     allowed = base_modules() | plugins | {*sys.stdlib_module_names, "labseq"}
     wrong = list[str]()
     for path in (*(ROOT / "labseq").rglob("*.py"), *(ROOT / "plugins").rglob("*.py")):
-        if path.relative_to(ROOT).parts[:2] in {("labseq", "web"), ("labseq", "testing")}:
+        if path.relative_to(ROOT).parts[:2] in OF_EXTRAS:
             continue
         for node in ast.parse(path.read_text("utf-8")).body:
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []

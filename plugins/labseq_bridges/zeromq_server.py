@@ -1,0 +1,127 @@
+"""A ZeroMQ socket (REP) of labseq: `python -m labseq_bridges.zeromq_server`. It needs pyzmq.
+
+Each request is a JSON object with the token, and gets one answer, a JSON object:
+
+    {"token": "...", "request": "go", "text": "run 17", "values": {"planner.degree_of_parallelism": 5}}
+    {"token": "...", "request": "wait", "timeout_s": 2.5}
+    {"token": "...", "request": "abort"}
+    {"token": "...", "request": "state"}
+
+`go` is answered {"answer": "busy"}, `wait` and `abort` with what labseq says of the shot. If the shot has not
+ended within `timeout_s`, `wait` is answered "busy", so that another request can come in between. A request
+that is refused is answered {"answer": "error", "reason": "..."}.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hmac
+import json
+import sys
+from collections.abc import Sequence
+from contextlib import closing, suppress
+from typing import Any
+
+from labseq_client import LabseqError
+
+from labseq_bridges.link import Link, add_arguments, link_of, plain
+
+LONGEST = 65536
+"""Longest request in bytes; ZeroMQ disconnects a peer that sends more."""
+MAX_WAIT_S = 3600.0
+KEYS: dict[str, set[str]] = {"go": {"text", "values"}, "wait": {"timeout_s"}, "abort": set(), "state": set()}
+
+
+class RequestError(Exception):
+    """A request that labseq is not asked; the text is the reason."""
+
+
+def answer_to(message: bytes, link: Link, token: str) -> dict[str, Any]:
+    """The answer to a request."""
+    try:
+        request = _checked(message, token)
+        return _asked(request, link)
+    except (RequestError, LabseqError, RuntimeError, OSError, ValueError, LookupError) as error:
+        return {"answer": "error", "reason": str(error) or type(error).__name__}
+
+
+def _checked(message: bytes, token: str) -> dict[str, Any]:
+    try:
+        request = json.loads(message)
+    except (ValueError, RecursionError):
+        raise RequestError("the request is not JSON") from None
+    given = request.pop("token", None) if isinstance(request, dict) else None
+    if not isinstance(given, str) or not hmac.compare_digest(given.encode(errors="replace"), token.encode()):
+        raise RequestError("the request must be an object with the right 'token'")
+    name = request.pop("request", None)
+    if not isinstance(name, str) or name not in KEYS:
+        raise RequestError(f"request is {str(name)[:40]!r}; expected {', '.join(KEYS)}")
+    unknown = request.keys() - KEYS[name]
+    if unknown:
+        raise RequestError(f"unknown key {min(unknown)[:40]!r}; {name!r} takes {sorted(KEYS[name])}")
+    return {"request": name, **request}
+
+
+def _asked(request: dict[str, Any], link: Link) -> dict[str, Any]:
+    name = request["request"]
+    if name == "go":
+        link.go(str(request.get("text", "")), _values(request.get("values", {})))
+        return {"answer": "busy"}
+    if name == "state":
+        return {"answer": "state", "state": link.state()}
+    answer = link.abort() if name == "abort" else link.wait(_timeout_s(request.get("timeout_s")))
+    return {"answer": "busy"} if answer is None else plain(answer)
+
+
+def _values(given: Any) -> dict[str, Any]:
+    if not isinstance(given, dict):
+        raise RequestError("values must be an object: address -> value")
+    return given
+
+
+def _timeout_s(given: Any) -> float | None:
+    if given is None:
+        return None
+    if not isinstance(given, (int, float)) or not 0 <= given <= MAX_WAIT_S:
+        raise RequestError(f"timeout_s is {str(given)[:40]}; expected 0 to {MAX_WAIT_S:g} s")
+    return max(0.001, given)
+
+
+def serve(socket: Any, link: Link, token: str) -> None:
+    """Answer requests one after the other, until an exception such as KeyboardInterrupt."""
+    while True:
+        if not socket.poll(200):  # Ctrl-C does not end a call that has just begun to receive
+            continue
+        parts = socket.recv_multipart()
+        socket.send(json.dumps(answer_to(b"".join(parts), link, token)).encode())
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the server until Ctrl-C."""
+    import zmq
+
+    parser = argparse.ArgumentParser(description="ZeroMQ REP socket of labseq")
+    parser.add_argument(
+        "--bind", default="127.0.0.1", help="address to listen on (default: this computer only)"
+    )
+    parser.add_argument("-p", "--port", type=int, default=5752, help="TCP port (default: %(default)d)")
+    add_arguments(parser)
+    options = parser.parse_args(arguments)
+    link = link_of(options)
+    with zmq.Context() as context, context.socket(zmq.REP) as socket:
+        socket.maxmsgsize = LONGEST
+        socket.linger = 0
+        try:
+            token = link.token()
+            socket.bind(f"tcp://{options.bind}:{options.port}")
+        except (OSError, zmq.ZMQError) as error:
+            parser.error(f"{error}; see --labseq-token, --bind and --port")
+        address = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        sys.stdout.write(f"listening on {address}\n")
+        sys.stdout.flush()
+        with suppress(KeyboardInterrupt), closing(link):
+            serve(socket, link, token)
+
+
+if __name__ == "__main__":
+    main()
