@@ -1,0 +1,100 @@
+"""Static tweezers that another system holds; labseq controls nothing of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from numpy.typing import NDArray
+
+from labseq.plugin import (
+    Context,
+    DeviceError,
+    LimitError,
+    Registry,
+    Settings,
+    StaticTweezers,
+    TweezersFacts,
+    hookimpl,
+)
+
+LABSEQ_API = 1
+
+
+@hookimpl
+def labseq_register(registry: Registry) -> None:
+    """Offer the static tweezers ``external``; in a dry run their virtual twin takes their place."""
+    registry.static_tweezers("external", ExternalStaticTweezers, ExternalSettings)
+
+
+class ExternalSettings(Settings):
+    """Static tweezers that another system holds; they have no settings."""
+
+    def identities(self) -> tuple[str, ...]:
+        """Nothing: any number of processes may rely on them."""
+        return ()
+
+
+class ExternalStaticTweezers(StaticTweezers):
+    """Static tweezers that are on, and stay on, whatever labseq does.
+
+    Args:
+        settings: None.
+        context: Their name.
+    """
+
+    any_thread = True
+
+    def __init__(self, settings: ExternalSettings, context: Context) -> None:
+        del settings
+        self._name = context.name or "static_tweezers"
+        self._is_open = False
+
+    @property
+    def facts(self) -> TweezersFacts:
+        """Nothing can be set; a line of the timing box may release the atoms."""
+        return TweezersFacts(control="nothing", ramps=False)
+
+    def open(self) -> None:
+        """Do nothing."""
+        self._is_open = True
+
+    def close(self) -> None:
+        """Do nothing."""
+        self._is_open = False
+
+    def safe_state(self) -> None:
+        """Do nothing: the light belongs to the other system."""
+
+    def load(self, amplitudes: tuple[NDArray[Any], NDArray[Any]] | None) -> None:
+        """Accept None alone.
+
+        Raises:
+            LimitError: Amplitudes are given.
+        """
+        self._check_open()
+        if amplitudes is not None:
+            raise LimitError(f"{self._name}: amplitudes", "given", "none: another system holds the array")
+
+    def start(self) -> None:
+        """Do nothing: the array is at its nominal depth."""
+        self._check_open()
+
+    def ramp(self, depth: float, duration_s: float) -> None:
+        """Accept the nominal depth alone.
+
+        Raises:
+            LimitError: Another depth.
+        """
+        self._check_open()
+        if depth != 1.0 or not duration_s >= 0:
+            value = f"{depth:g} of the nominal depth within {duration_s:g} s"
+            raise LimitError(f"{self._name}: ramp", value, "to 1 only: another system holds the array")
+
+    def describe(self) -> Mapping[str, Any]:
+        """That nothing is known of them."""
+        return {"model": "held by another system"}
+
+    def _check_open(self) -> None:
+        if not self._is_open:
+            raise DeviceError(self._name, "not open; call open() first")

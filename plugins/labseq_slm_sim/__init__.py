@@ -1,0 +1,5 @@
+"""A simulated SLM for ``labseq_slm``: from the grey levels that it is sent to the light at the sites."""
+
+from labseq_slm_sim.panel import SimulatedSlm
+
+__all__ = ["SimulatedSlm"]
