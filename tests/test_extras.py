@@ -21,6 +21,8 @@ from labseq_nidaqmx.library import import_package
 from labseq_optuna.scanner import OptunaScanner, OptunaSettings
 from labseq_pylablib.library import DCAM, load as load_pylablib
 from labseq_pylon.library import load_pypylon
+from labseq_slm.outputs import Display, PngFile
+from labseq_slm.settings import SlmSettings
 
 import labseq.testing
 from labseq import messages
@@ -64,6 +66,9 @@ NEEDS: dict[tuple[str, str, str], Callable[[], object]] = {
     ("pylon", "pypylon", "pypylon.pylon"): lambda: load_pypylon("camera"),
     ("remote", "pyzmq", "zmq"): require_packages,
     ("remote", "msgpack", "msgpack"): require_packages,
+    ("slm", "slmsuite", "slmsuite"): lambda: Display("static_tweezers", SlmSettings()).open(),
+    ("slm", "pyglet", "pyglet"): lambda: Display("static_tweezers", SlmSettings()).open(),
+    ("slm", "pillow", "PIL.Image"): lambda: PngFile("static_tweezers", Path("a.png")).open(),
     ("testing", "hypothesis", "hypothesis"): lambda: labseq.testing.CameraContract,
     ("testing", "pytest", "pytest"): lambda: labseq.testing.CameraContract,
     ("web", "starlette", "starlette"): check_packages,

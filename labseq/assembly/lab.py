@@ -64,6 +64,7 @@ def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> L
         lines=objects.get("lines"),
         line_specs=profile.line_specs,
         budgets=profile.budgets.model_dump(),
+        camera_is_simulated=chosen["camera"].virtual_time,
     )
     if problems := [*wrong_wiring(hardware.document, lab)]:
         raise ConfigError(problems)

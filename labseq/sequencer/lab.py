@@ -74,6 +74,7 @@ class Lab:
 
     Attributes:
         budgets: Budgets of stages that do not have their own: stage -> seconds.
+        camera_is_simulated: Whether the camera sees the simulated atoms, so that their truth is recorded.
     """
 
     grid: SiteGrid
@@ -98,6 +99,7 @@ class Lab:
     lines: Lines | None = field(default=None, kw_only=True)
     line_specs: tuple[LineSpec, ...] = field(default=(), kw_only=True)
     budgets: Mapping[str, float] = field(default_factory=dict[str, float], kw_only=True)
+    camera_is_simulated: bool = field(default=True, kw_only=True)
 
     @property
     def step_context(self) -> StepContext:

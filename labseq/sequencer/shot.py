@@ -610,7 +610,7 @@ class RunningShot:
     def record_truth(self) -> None:
         """Record the simulation's true occupancy, losses and events of the atoms."""
         simulation, readings, timeout_s = self.simulation, self.record.readings, self.call_timeout_s
-        if simulation is None:
+        if simulation is None or not self.lab.camera_is_simulated:
             return
         truth = self.call("simulation", timeout_s, simulation.truth)
         if truth is not None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from labseq_slm.static_tweezers import SlmStaticTweezers
 from labseq_virtual.settings import SimulationSettings
 from labseq_virtual.simulation import VirtualSimulation
 from numpy.typing import NDArray
@@ -132,6 +133,54 @@ def test_frames_without_measurable_spots_end_the_run(
     lab = make_lab(tmp_path, SIMULATION + CAMERAS[camera])
     with pytest.raises(DeviceError, match=message):
         lab.calibrate("tweezers", overrides=changes)
+
+
+SLM = """grid: {rows: 8, cols: 10, spacing: 4.49 um}
+detector: {use: threshold, frame: [150, 240], centre_px: [74.5, 119.5]}
+devices:
+  trap_camera: {use: virtual, role: camera, region: {y: 180, x: 130, height: 152, width: 252}}
+  meter: {use: virtual, values: {power: 1.0}}
+simulation:
+  use: virtual
+  machine_seed: 3
+  depth_disorder: 10 %
+"""
+BY_SLM = (
+    "profile.static_tweezers={use: slm, output: simulated, pixels: [256, 256], pixel_pitch: 50 um, "
+    "offset: [70 um, 0 um]}"
+)
+TOTAL = ["shot.0.equalise.device=meter", "shot.0.equalise.value=power"]
+
+
+def test_the_sites_of_an_slm_are_equalised_one_by_one(
+    tmp_path: Path, make_lab: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    powers: list[NDArray[np.float64]] = []
+    safe = SlmStaticTweezers.safe_state
+    simulations: list[VirtualSimulation] = []
+    opened = VirtualSimulation.open
+    monkeypatch.setattr(VirtualSimulation, "open", lambda self: (simulations.append(self), opened(self))[1])
+
+    def safe_state(self: SlmStaticTweezers) -> None:
+        powers.append(simulations[-1].spot_powers())
+        safe(self)
+
+    monkeypatch.setattr(SlmStaticTweezers, "safe_state", safe_state)
+    lab = make_lab(tmp_path, SLM)
+    outcome = lab.calibrate("tweezers", overrides=[BY_SLM])
+    entry = outcome.stored.entry
+    assert outcome.run.shots[0].readings["equalise.spreads"][0] > 0.08
+    assert np.std(powers[0]) < 0.01 * np.mean(powers[0])
+    assert entry.quality["separable_spread"] <= 0.005
+    assert entry.values["weights"].shape == (8, 10)
+    assert np.ptp(entry.values["row_amplitudes"]) == 0, "other static tweezers can use the calibration, too"
+    assert "sites are equal to 0." in outcome.summary_lines[0]
+    again = lab.calibrate("tweezers", seed=2, overrides=[BY_SLM])
+    assert len(again.run.shots[0].readings["equalise.spreads"]) <= 2
+    outcome = lab.calibrate("tweezers")  # of the virtual static tweezers, which have tones
+    assert "weights" not in outcome.stored.entry.values
+    with pytest.raises(DeviceError, match=r"is one number, .* weights of sites need a camera, or an array"):
+        lab.calibrate("tweezers", overrides=[BY_SLM, *TOTAL])
 
 
 class PowerMeter:
