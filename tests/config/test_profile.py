@@ -254,8 +254,19 @@ TRIGGER = {"channel": 0, "on": ["image"], "triggers": "camera"}
         ({"a": TRIGGER | {"lead": "1 ms"}}, "lead is set for a trigger"),
         ({"a": PULSE | {"lag": "1 ms"}}, "lag is set beside pulse"),
         ({"a": PULSE | {"on": ["load", "idle"]}}, "a pulse has 'idle' among its steps"),
+        (
+            {"a": PULSE | {"channel": "ao0"}},
+            "a whole number, or a name with a slash such as 'Dev1/port0/line3'",
+        ),
     ],
 )
 def test_lines_that_contradict_themselves_are_refused(channels: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         LinesChoice.model_validate({"use": "box", "channels": channels})
+
+
+def test_lines_are_in_the_order_of_their_outputs() -> None:
+    outputs = [10, "Dev1/port0/line10", "Dev1/port0/line9", 9]
+    channels = {f"line_{i}": {"channel": output} for i, output in enumerate(outputs)}
+    choice = LinesChoice.model_validate({"use": "box", "channels": channels})
+    assert [spec.channel for spec in choice.specs()] == [9, 10, "Dev1/port0/line9", "Dev1/port0/line10"]
