@@ -193,9 +193,9 @@ class NidaqmxLines(Lines):
     def describe(self) -> Mapping[str, Any]:
         """Cards, lines, settings."""
         cards = {name: device.product_type for name, device in self._devices.items()}
-        numbers = {name: f"{device.serial_num:X}" for name, device in self._devices.items()}
+        numbers = ", ".join(f"{device.serial_num:X}" for device in self._devices.values())
         lines = {spec.name: spec.channel for spec in self._specs}
-        facts = {"model": ", ".join(cards.values()), "cards": cards, "serial_numbers": numbers}
+        facts = {"model": ", ".join(cards.values()), "cards": cards, "serial_number": numbers}
         return {**facts, "lines": lines, **self._settings.model_dump(mode="json")}
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
