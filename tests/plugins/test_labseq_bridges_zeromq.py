@@ -20,6 +20,7 @@ from .labseq_follow_rig import MAX_WAIT_S, token_file
 from .test_labseq_follow_session import run_led
 
 TOKEN = "0123456789abcdef" * 2
+MAY_SET = "leader={may_set: [planner.degree_of_parallelism]}"
 SERVER = [sys.executable, "-m", "labseq_bridges.zeromq_server", "-p", "0", "--labseq-port"]
 
 
@@ -73,7 +74,7 @@ def test_it_leads_one_run_after_the_other(tmp_path: Path) -> None:
     with served(port) as peer:
 
         def lead(_address: str) -> None:
-            go = peer.ask("go", text="run 17")
+            go = peer.ask("go", text="run 17", values={"planner.degree_of_parallelism": 3})
             came.append([go, peer.ask("wait", timeout_s=0), peer.ask("wait")])
 
         def lead_and_abort(_address: str) -> None:
@@ -81,7 +82,7 @@ def test_it_leads_one_run_after_the_other(tmp_path: Path) -> None:
             came.append([*refused, peer.ask("go"), peer.ask("abort")])
             lead(_address)
 
-        options = ("shot.2.rearrange.cycles=1", f"profile.devices.leader.port={port}", "attempts=1")
+        options = ("shot.2.rearrange.cycles=1", f"profile.devices.leader.port={port}", "attempts=1", MAY_SET)
         runs = [run_led(each, tmp_path, *options, shots=1) for each in (lead, lead_and_abort)]
         refused = peer.ask("go")
     first, (_, wrong, go, aborted), second = came
@@ -92,6 +93,7 @@ def test_it_leads_one_run_after_the_other(tmp_path: Path) -> None:
         assert answer["before"] == shot.occupancies[0].astype(int).tolist()
         assert answer["after"] == shot.occupancies[-1].astype(int).tolist()
         assert shot.readings["leader.go"][-1] == "run 17"
+        assert shot.parameters["planner.degree_of_parallelism"] == 3
     assert (wrong["answer"], wrong["is_refused"]) == ("failed", True)
     assert "shot.9.hold" in wrong["reason"]
     assert (aborted["answer"], "aborted" in aborted["reason"]) == ("failed", True)
