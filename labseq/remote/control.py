@@ -17,7 +17,7 @@ from labseq.errors import DeviceError, one_of
 from labseq.messages import clean, format_error
 from labseq.remote.known import KnownKeys
 from labseq.remote.served import POLL_S, ServedDevice, why_ended
-from labseq.remote.sessions import CLOSED, Session
+from labseq.remote.sessions import CLOSED, Faults, Session
 from labseq.wire import LOST_S, PROTOCOL, Connections, MessageError, pack, report_error, unpack
 
 MAX_SESSIONS: Final = 64
@@ -51,6 +51,7 @@ class Control:
         self.ports = {name: port + number for number, name in enumerate(devices, 1)}
         self._keys = keys
         self._socket = socket
+        self._faults = Faults()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="labseq control", daemon=True)
 
@@ -90,8 +91,11 @@ class Control:
             frames = self._socket.recv_multipart(copy=False)
         except zmq.Again:
             return
+        client = frames[-1].get("User-Id") if self._keys.own is not None else frames[0].bytes
+        if self._faults.are_too_many(client):
+            return
         with suppress(zmq.ZMQError):  # the client is gone
-            self._socket.send_multipart([frames[0], *self._answer(frames)])
+            self._socket.send_multipart([frames[0], *self._answer(frames, client)])
 
     def _end_lost_sessions(self, now_s: float, passed_s: float, ended: set[tuple[int, int]]) -> None:
         """End the sessions of clients that have disappeared, or whose key was withdrawn."""
@@ -108,8 +112,8 @@ class Control:
                     device.end_session(session, "its key was withdrawn")
             device.rescue_stuck()
 
-    def _answer(self, frames: list[Any]) -> list[Any]:
-        number = 0
+    def _answer(self, frames: list[Any], client: object) -> list[Any]:
+        number, start_s = 0, time.thread_time()
         try:
             message = unpack([frame.buffer for frame in frames[1:]])
             if not isinstance(message, dict) or type(message.get("n")) is not int:
@@ -119,6 +123,7 @@ class Control:
         except DeviceError as error:
             return pack({"n": number, "error": report_error(error)})
         except Exception as error:  # noqa: BLE001 - no message may end this thread
+            self._faults.count(client, time.thread_time() - start_s)
             failure = DeviceError("server", f"the server cannot read a message: {format_error(error)}")
             return pack({"n": number, "error": report_error(failure)})
 

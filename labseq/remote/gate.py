@@ -30,6 +30,8 @@ MAX_UNANSWERED: Final = MAX_MESSAGE + (1 << 20)
 
 ZeroMQ keeps a message of any number of parts until its last one has come.
 """
+UNREAD_S: Final = 10.0
+"""Longest time that bytes for a client may wait until it reads, in seconds."""
 _BEFORE_KEY: Final = 64 + 170 + 12
 """Bytes that ZeroMQ sends to a client whose key it does not know: greeting, WELCOME, ERROR (ZMTP 3.1, CURVE).
 READY, for one that it knows, is longer than ERROR."""
@@ -39,10 +41,17 @@ _BEFORE_READY: Final = 64
 
 @dataclass(eq=False, slots=True)
 class _Side:
-    """One of the two sockets of a connection, and the bytes that it has not taken yet."""
+    """One of the two sockets of a connection, and the bytes that it has not taken yet.
+
+    Attributes:
+        socket: The socket.
+        waiting: The bytes.
+        took_s: When it last took any.
+    """
 
     socket: socket.socket
     waiting: memoryview = field(default_factory=lambda: memoryview(b""))
+    took_s: float = 0.0
 
 
 @dataclass(eq=False, slots=True)
@@ -200,6 +209,9 @@ class Gate:
         for connection in [c for c in self._open if 0.0 < c.until_s < now_s]:
             self._refuse(connection.address, f"it has shown no key within {HANDSHAKE_S:g} s")
             self._close(connection)
+        for connection in [c for c in self._open if c.client.waiting and c.client.took_s < now_s - UNREAD_S]:
+            self._refuse(connection.address, f"it has not read for {UNREAD_S:g} s")
+            self._close(connection)
 
     def _refuse(self, address: str, why: str) -> None:
         """Report a connection that is closed; a flood of them must not fill the log."""
@@ -218,6 +230,7 @@ class Gate:
         try:
             if ready & selectors.EVENT_WRITE:
                 side.waiting = side.waiting[side.socket.send(side.waiting) :]
+                side.took_s = time.monotonic()
             elif not other.waiting:
                 self._receive(connection, side, other)
             self._watch(connection)
@@ -241,7 +254,7 @@ class Gate:
         n_sent = 0
         with suppress(BlockingIOError):
             n_sent = other.socket.send(self._buffer[:n])
-        other.waiting = memoryview(bytes(self._buffer[n_sent:n]))
+        other.waiting, other.took_s = memoryview(bytes(self._buffer[n_sent:n])), time.monotonic()
 
     def _limit_unanswered(self, connection: _Connection) -> None:
         """Close a connection that sends too much; of all together too much, the one that sent most."""

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
-from labseq.errors import ConfigError, DeviceError, Problem, StopRequested
+from labseq.errors import ConfigError, DeviceError, LabseqError, Problem, StopRequested
 from labseq.messages import format_error
 from labseq.remote.drivers import DESCRIBING, ClientDriver, DeviceEntry
-from labseq.remote.sessions import Session
+from labseq.remote.known import KnownKeys
+from labseq.remote.sessions import Faults, Session
 from labseq.wire import Connections, MessageError, pack, report_error, unpack
 
 POLL_S: Final = 0.03
@@ -44,6 +45,20 @@ class Call:
 
 
 _TYPES: Final = {"session": bytes, "n": int, "call": str, "args": list, "named": dict}
+
+
+class RefusedError(Exception):
+    """A message that is not carried out.
+
+    Attributes:
+        number: Number of the call; 0 for a message that cannot be read.
+        error: Why.
+    """
+
+    def __init__(self, number: int, error: LabseqError) -> None:
+        super().__init__(str(error))
+        self.number = number
+        self.error = error
 
 
 class ForControlError(Exception):
@@ -82,7 +97,7 @@ class ServedDevice:
         entry: The device.
         socket: A ROUTER; used in the device's thread only.
         control_port: The port that clients have to connect to first.
-        is_known: Whether a client's key is still known.
+        keys: Who may connect.
         report: Receives what happens, for the operator.
     """
 
@@ -91,7 +106,7 @@ class ServedDevice:
         entry: DeviceEntry,
         socket: Any,
         control_port: int,
-        is_known: Callable[[str], bool],
+        keys: KnownKeys,
         report: Callable[[str], object],
     ) -> None:
         self.name = entry.name
@@ -103,8 +118,9 @@ class ServedDevice:
         self._entry = entry
         self._socket = socket
         self._control_port = control_port
-        self._is_known = is_known
+        self._keys = keys
         self._report = report
+        self._faults = Faults()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._serve, name=f"labseq {entry.name}", daemon=True)
 
@@ -181,27 +197,40 @@ class ServedDevice:
     def _handle(self, frames: list[Any]) -> None:
         import zmq
 
+        client = frames[-1].get("User-Id") if self._keys.own is not None else frames[0].bytes
+        if self._faults.are_too_many(client):
+            return
+        start_s = time.thread_time()
         try:
-            if parts := self._answer(frames):
+            try:
+                parts = self._answer(frames)
+            except RefusedError as refused:
+                parts = pack({"n": refused.number, "error": report_error(refused.error)})
+                self._faults.count(client, time.thread_time() - start_s)
+            if parts:
                 with suppress(zmq.ZMQError):  # the client is gone
                     self._socket.send_multipart([frames[0], *parts], copy=False)
         except Exception as error:  # noqa: BLE001 - no message may end this thread
             self._report_with_name(f"a message could not be answered: {format_error(error)}")
 
     def _answer(self, frames: list[Any]) -> list[Any]:
-        """The reply to a message; empty for one that is not answered."""
+        """The reply to a message; empty for one that is not answered.
+
+        Raises:
+            RefusedError: The message is not carried out.
+        """
         try:
             call = read_call([frame.buffer for frame in frames[1:]])
         except MessageError as error:
-            return self._refusal(0, f"the server cannot read a message: {error}")
-        except ForControlError:
-            return pack({"n": 0, "error": report_error(self._wrong_port())})
+            raise self._refused(0, f"the server cannot read a message: {error}") from error
+        except ForControlError as error:
+            raise RefusedError(0, self._wrong_port()) from error
         session = self.sessions.get(call.session)
         if session is None:
-            return self._refusal(call.n, why_ended(self.ended, call.session))
+            raise self._refused(call.n, why_ended(self.ended, call.session))
         peer = frames[-1].get("User-Id") if session.peer else ""
         if reason := self._why_refused(session, peer, call.n):
-            return self._refusal(call.n, reason)
+            raise self._refused(call.n, reason)
         if call.n <= session.number:  # a repetition: the method must not be called twice
             return session.reply if call.n == session.number else []
         session.begin_call(call.n, call.call)
@@ -213,7 +242,7 @@ class ServedDevice:
         """Why a call is not carried out; "" if it may be. Wrong calls end their session."""
         if peer != session.peer:
             return "the connection belongs to another key"
-        if not self._is_known(session.peer):
+        if not self._keys.is_known(session.peer):
             self.end_session(session, "its key was withdrawn")
         elif number > session.number + 1:
             self.end_session(session, f"its calls came out of order: {number} after {session.number}")
@@ -223,8 +252,8 @@ class ServedDevice:
         what = f"this is the port of a device, '{self.name}', and not of its server"
         return ConfigError(Problem(what, expected=f"port {self._control_port}", hint="change 'address'"))
 
-    def _refusal(self, number: int, text: str) -> list[Any]:
-        return pack({"n": number, "error": report_error(DeviceError(self.name, text))})
+    def _refused(self, number: int, text: str) -> RefusedError:
+        return RefusedError(number, DeviceError(self.name, text))
 
     def _reply(self, session: Session, call: Call) -> list[Any]:
         answer: dict[str, Any] = {"n": call.n}
@@ -240,7 +269,8 @@ class ServedDevice:
         try:
             return pack(answer)
         except MessageError as error:
-            return self._refusal(call.n, f"the result of {call.call}() cannot be sent: {error}")
+            failure = DeviceError(self.name, f"the result of {call.call}() cannot be sent: {error}")
+            return pack({"n": call.n, "error": report_error(failure)})
 
     def _carry_out(self, session: Session, call: Call) -> Any:
         if call.call == "attach":

@@ -196,8 +196,7 @@ class Server:
             self._addresses = [socket.get_string(zmq.LAST_ENDPOINT) for socket in sockets]
             socket, *at_devices = sockets
             for entry, at_device in zip(entries, at_devices, strict=True):
-                known = self._keys.is_known
-                self.devices[entry.name] = ServedDevice(entry, at_device, port, known, self._report)
+                self.devices[entry.name] = ServedDevice(entry, at_device, port, self._keys, self._report)
         except ConfigError:
             self._zmq.destroy(linger=0)
             raise

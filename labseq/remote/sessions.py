@@ -19,6 +19,38 @@ CLOSED: Final = "closed"
 """Why a session has ended, if the client ended it."""
 
 
+FAULTY_S: Final = 0.1
+"""Time of a thread that the wrong messages of a client may take at once, in seconds."""
+FAULTY_SHARE: Final = 0.01
+"""The share of its time that they may take after that."""
+
+
+class Faults:
+    """The time that wrong messages have taken, client by client; used in one thread.
+
+    A client that takes too much is not read until its share has grown again, so that others need not wait.
+    """
+
+    def __init__(self) -> None:
+        self._left: dict[object, tuple[float, float]] = {}  # client -> time left, and when that was
+
+    def are_too_many(self, client: object) -> bool:
+        """Whether the messages of a client are to be thrown away unread."""
+        return client in self._left and self._left_s(client) <= 0.0
+
+    def count(self, client: object, took_s: float) -> None:
+        """Count the time that a wrong message of a client took, in seconds."""
+        left_s = self._left_s(client) - took_s
+        self._left.pop(client, None)
+        self._left[client] = left_s, time.monotonic()
+        for oldest in [*self._left][:-1000]:
+            del self._left[oldest]
+
+    def _left_s(self, client: object) -> float:
+        left_s, then_s = self._left.get(client, (FAULTY_S, 0.0))
+        return min(FAULTY_S, left_s + FAULTY_SHARE * (time.monotonic() - then_s))
+
+
 class Abort(StopFlag):
     """The request to end the call in progress; the next call begins without it."""
 

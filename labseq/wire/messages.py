@@ -7,10 +7,12 @@ Nothing that arrives is executed: it can only become plain values, arrays of num
 from __future__ import annotations
 
 import dataclasses
+import gc
 import math
 import re
 import sys
-from collections.abc import Mapping, Sequence, Set as AbstractSet
+from collections.abc import Generator, Mapping, Sequence, Set as AbstractSet
+from contextlib import contextmanager
 from enum import Enum
 from pathlib import PurePath
 from typing import Any, Final, TypeAlias, cast
@@ -208,11 +210,24 @@ def unpack(parts: Sequence[Part]) -> Any:
     if len(header) > MAX_HEADER:
         raise MessageError(f"its first part has {len(header)} bytes; expected at most {MAX_HEADER}")
     try:
-        return inner(header)
+        with _no_collections():
+            return inner(header)
     except MessageError:
         raise
     except Exception as error:  # msgpack and constructors raise many kinds
         raise MessageError(f"it is damaged: {format_error(error)[:200]}") from error
+
+
+@contextmanager
+def _no_collections() -> Generator[None]:
+    """Context manager: no collection of garbage, which takes most of the time of a list of many lists."""
+    is_collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if is_collecting:
+            gc.enable()
 
 
 def _array(parts: Sequence[Part], content: list[Any], unused: list[int]) -> NDArray[Any]:

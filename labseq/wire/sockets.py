@@ -25,9 +25,11 @@ LOST_S: Final = 0.75
 HANDSHAKE_S: Final = 2.0
 """Longest time for a client to show its key, in seconds."""
 MAX_WAITING: Final = 4
-"""Messages of a connection that wait to be read: a client waits for each reply.
+"""Messages of a connection that wait to be read: a client waits for each reply."""
+MAX_REPLIES: Final = 8
+"""Replies to a connection that wait to be sent; a ROUTER drops those above.
 
-Replies need a high limit: a ROUTER drops those above it, and learns late which were sent.
+It learns of every fourth only that it was sent, so a client that waits for each reply has five at most.
 """
 
 _ADDRESS: Final = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]@]+):(\d{1,5})")
@@ -100,6 +102,7 @@ def server_socket(context: zmq.Context[Any], address: str, keys: Keys | None) ->
     _limit(socket)
     socket.set(zmq.HANDSHAKE_IVL, round(1e3 * HANDSHAKE_S))
     socket.set(zmq.RCVHWM, MAX_WAITING)
+    socket.set(zmq.SNDHWM, MAX_REPLIES)
     if keys is not None:
         socket.zap_domain = b"labseq"
         socket.curve_server, socket.curve_secretkey = True, keys.secret

@@ -166,6 +166,39 @@ def test_a_message_whose_parts_do_not_end_is_cut_off(server: Served, monkeypatch
         assert "error" in ask(other, {"n": 1, "op": "nonsense"})
 
 
+def test_a_client_that_sends_garbage_is_not_read_while_others_are_answered(server: Served) -> None:
+    garbage = _packed([[]] * (1 << 19))
+    for port in (server.port, server.port + 5):
+        with connected(port) as faulty, connected(port) as other:
+            n_answers = 0
+            faulty.send(garbage)
+            while n_answers < 50 and faulty.poll(1000):
+                faulty.recv_multipart()
+                faulty.send(garbage)
+                n_answers += 1
+            assert 0 < n_answers < 50
+            assert "error" in ask(other, {"n": 1, "op": "nonsense"})
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the socket of ZeroMQ is one of the family UNIX")
+def test_a_client_that_does_not_read_its_replies_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "UNREAD_S", 0.3)
+    told, port = list[str](), free_port()
+    ports = gate.Gate("127.0.0.1", port, 1, has_keys=False, report=told.append)
+    try:
+        with socket.socket(socket.AF_UNIX) as listening:
+            listening.bind(ports.addresses[0].removeprefix("ipc://"))
+            listening.listen()
+            ports.start(ports.addresses)
+            with socket.create_connection(("127.0.0.1", port)), listening.accept()[0] as zeromq:
+                zeromq.settimeout(60.0)
+                with pytest.raises(ConnectionError):
+                    zeromq.sendall(bytes(64 << 20))
+    finally:
+        ports.end()
+    assert told == ["a connection from 127.0.0.1 was closed: it has not read for 0.3 s"]
+
+
 SERVE = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_NOFILE, (512, 512))
