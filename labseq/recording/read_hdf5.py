@@ -81,11 +81,22 @@ _KINDS: Final = {"text": str, "integer": int, "int64": int, "bool": bool, "float
 
 
 def read_texts(group: Any, fields: Sequence[Field]) -> dict[str, Any]:
-    """Read texts and JSON: attribute of the record -> value; those of a newer minor format are ignored."""
-    texts = {field: group[field.name][()].decode() for field in fields if field.name in group}
-    return {
-        field.attribute: parse_value(text) if field.dtype == "json" else text for field, text in texts.items()
-    }
+    """Read texts and JSON: attribute of the record -> value; those of a newer minor format are ignored.
+
+    Raises:
+        TypeError: JSON is not a mapping, or for plugins and steps not a list.
+    """
+    values: dict[str, Any] = {}
+    for field in fields:
+        if field.name not in group:
+            continue
+        text = group[field.name][()].decode()
+        value = parse_value(text) if field.dtype == "json" else text
+        kind = str if field.dtype == "text" else list if field.name in ("plugins", "steps") else dict
+        if not isinstance(value, kind):
+            raise TypeError(f"'{field.name}' is {type(value).__name__}; expected {kind.__name__}")
+        values[field.attribute] = value
+    return values
 
 
 def read_values(group: Any) -> dict[str, Any]:

@@ -62,6 +62,8 @@ def read_content(path: Path) -> ShotContent:
 def content_of(entry: Any) -> ShotContent:
     """Read a shot's file, :func:`opened`, without its frames."""
     run = read_fields(entry["run"], schema.RUN) | read_texts(entry["run"], schema.RUN_TEXTS)
+    if missing := [text.name for text in schema.RUN_TEXTS if text.attribute not in run]:
+        raise ValueError(f"/entry/run/{missing[0]} is missing")
     fill, clear = (entry[f"target/{name}"][()].astype(np.bool_) for name in ("fill", "clear"))
     return ShotContent(
         _record(entry), run, TargetPattern(fill, clear, run["target.name"], regions_of(run["resolved"]))

@@ -27,7 +27,7 @@ from labseq.recording.folders import PROFILE_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import read_state
 from labseq.web.endpoint import Endpoint, describe, in_thread
 from labseq.web.history import Columns
-from labseq.web.live import MAX_VIEWERS, Live
+from labseq.web.live import Live
 from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
 from labseq.web.scan import map_choices
 from labseq.web.series import finite
@@ -101,11 +101,12 @@ class Api:
 
         After `Last-Event-ID` the current state is sent, or nothing if it is still the same.
         """
-        if self._live.n_viewers >= MAX_VIEWERS:
-            return JSONResponse({"error": f"{MAX_VIEWERS} pages are open already"}, 503)
+        address = request.client.host if request.client else ""
+        if not self._live.has_room(address):
+            return JSONResponse({"error": f"{self._live.n_viewers} pages are open already"}, 503)
         query = request.query_params
         channel = self._live.channel(query.get("day", ""), query.get("name", ""), _quantity(request))
-        states = channel.states(request.headers.get("last-event-id", ""))
+        states = self._live.states(channel, request.headers.get("last-event-id", ""), address)
         headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
         return StreamingResponse(states, media_type="text/event-stream", headers=headers)
 

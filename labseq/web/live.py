@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import zlib
-from collections.abc import AsyncIterator, Callable
+from collections import Counter
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
 
@@ -20,6 +21,7 @@ POLL_S: Final = 0.1
 HEARTBEAT_S: Final = 15.0
 """Something is sent at least this often, in seconds, so that a dead connection is noticed."""
 MAX_VIEWERS: Final = 100
+MAX_VIEWERS_OF_ADDRESS: Final = 50
 _THREADS: Final = ThreadPoolExecutor(2, "labseq web live")
 """Pages that watch many runs must not keep other requests waiting for a thread."""
 
@@ -42,7 +44,7 @@ class Channel:
         self.n_viewers = 0
         self.version = 0
 
-    async def states(self, after: str) -> AsyncIterator[str]:
+    async def states(self, after: str) -> AsyncGenerator[str, None]:
         """The states as server-sent events, from now on until the browser leaves.
 
         The last shot, which is half of a state, is an event of its own, sent before the state if it is new.
@@ -99,6 +101,22 @@ class Live:
         self._limits = limits
         self._channels: dict[str, Channel] = {}
         self._states: dict[str, RunState] = {}
+        self._n_of_address: Counter[str] = Counter()
+
+    def has_room(self, address: str) -> bool:
+        """Whether one more page of an address may follow a run."""
+        return self.n_viewers < MAX_VIEWERS and self._n_of_address[address] < MAX_VIEWERS_OF_ADDRESS
+
+    async def states(self, channel: Channel, after: str, address: str) -> AsyncIterator[str]:
+        """The states of a channel, for a page of an address; see :meth:`Channel.states`."""
+        self._n_of_address[address] += 1
+        try:
+            async with contextlib.aclosing(channel.states(after)) as states:
+                async for state in states:
+                    yield state
+        finally:
+            self._n_of_address[address] -= 1
+            self._n_of_address += Counter()  # without addresses that have none
 
     @property
     def n_viewers(self) -> int:

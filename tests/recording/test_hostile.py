@@ -104,6 +104,36 @@ def more_batches_than_planned(file: Any, secret: Path) -> None:
     file["entry/rearrangement/cycles"][...] = cycles
 
 
+def other_json(file: Any, secret: Path) -> None:
+    del file["entry/run/provenance"]
+    file["entry/run"].create_dataset("provenance", data=np.bytes_(b"[1]"))
+
+
+def no_settings(file: Any, secret: Path) -> None:
+    del file["entry/run/overrides"]
+
+
+def many_attributes(file: Any, secret: Path) -> None:
+    for number in range(200):
+        file["entry/detection/occupancy"].attrs[f"a{number}"] = number
+
+
+def resized(path: str, change: Callable[[Any], Any]) -> Callable[[Any, Path], None]:
+    """An array or table in place of the one at a path."""
+
+    def plant(file: Any, secret: Path) -> None:
+        data, attributes = file[path][()], dict(file[path].attrs)
+        del file[path]
+        file.create_dataset(path, data=change(data)).attrs.update(attributes)
+
+    return plant
+
+
+def retyped(table: Any) -> Any:
+    columns = [(name, "f8" if name == "step" else table.dtype[name]) for name in table.dtype.names]
+    return table.astype(columns)
+
+
 def deep_json(file: Any, secret: Path) -> None:
     del file["entry/readings"]
     file["entry"].create_dataset("readings", data=np.bytes_(b"[" * 500 + b"]" * 500))
@@ -130,6 +160,15 @@ def many_parts(file: Any, secret: Path) -> None:
         (text_of_any_length, "/entry/readings is a text of variable length, which labseq does not use"),
         (attribute_of_any_length, "the attribute 'status' is a text of variable length"),
         (more_batches_than_planned, "33554432 of 3 batches were played"),
+        (other_json, "'provenance' is list; expected dict"),
+        (no_settings, "/entry/run/overrides is missing"),
+        (many_attributes, "/entry/detection/occupancy has more than 100 attributes"),
+        (resized("entry/detection/confidence", lambda a: a[:1]), " along 'image'; expected "),
+        (
+            resized("entry/target/clear", lambda a: a[0]),
+            "/entry/target/clear has the shape (5,); expected (row",
+        ),
+        (resized("entry/detection/images", retyped), "'step' of /entry/detection/images is of another type"),
         (deep_json, "it is nested too deep"),
         (many_parts, "it has more than 500,000 lists and objects"),
     ],

@@ -16,6 +16,8 @@ from urllib.request import urlopen
 import psutil
 import pytest
 
+from labseq.web.live import MAX_VIEWERS_OF_ADDRESS
+
 SERVE = """
 import sys
 from labseq.web import connections
@@ -105,6 +107,25 @@ def test_idle_connections_keep_nobody_out(name: str, request: pytest.FixtureRequ
     finally:
         for peer in idle:
             peer.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a second address of this computer")
+def test_pages_of_one_address_leave_room_for_those_of_others(running: tuple[psutil.Process, str]) -> None:
+    place = urlsplit(running[1])
+
+    def follow(source: str) -> socket.socket:
+        peer = socket.create_connection((place.hostname, place.port), 60.0, (source, 0))
+        peer.sendall(b"GET /api/v1/events HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n")
+        return peer
+
+    pages = list[tuple[socket.socket, bytes]]()
+    for _ in range(MAX_VIEWERS_OF_ADDRESS + 1):
+        page = follow("127.0.0.1")
+        pages.append((page, page.recv(1 << 12)))
+    pages.append((other := follow("127.0.0.2"), other.recv(1 << 12)))
+    assert [b" 503 " in answer for _, answer in pages] == [*[False] * MAX_VIEWERS_OF_ADDRESS, True, False]
+    for page, _ in pages:
+        page.close()
 
 
 @pytest.mark.parametrize("tls", [False, True])
