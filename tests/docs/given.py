@@ -24,6 +24,9 @@ LOOK: Final = ROOT / "docs" / "how-to" / "replay-frames.md"
 """The page with the files ``look.yaml`` and ``replay.yaml``."""
 OWN_RUNS: Final = ("docs/explanation/played-waveforms.md", "docs/tutorials")
 """Pages that speak of the runs that they have taken themselves."""
+REAL_LAB: Final = ("docs/how-to/first-day.md",)
+"""Pages that mean the profile ``lab`` as it is; on all others it is the virtual lab, to be run."""
+
 NEEDED: Final = {"docs/how-to/calibrate.md": "libaravis", "docs/how-to/cameras-genicam.md": "libaravis"}
 """Page -> what its simulators need that is not on every machine."""
 SHOTS: Final = {
@@ -118,7 +121,8 @@ def virtual_lab(to: Path) -> None:
 def prepare(page: str, blocks: list[Block], to: Path, store: Store) -> Given:
     """All that a page takes for granted, in a folder."""
     copy_repository(to)
-    virtual_lab(to)
+    if page not in REAL_LAB:
+        virtual_lab(to)
     for block in blocks if not page.startswith(OWN_RUNS) else []:
         store.give(block.text, to)
     return GIVEN[page](to) if page in GIVEN else Given()

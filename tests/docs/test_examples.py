@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,12 @@ def test_every_block_is_in_a_fence_and_every_comment_belongs_to_one() -> None:
         assert not re.search(r"^ *~~~", text, re.MULTILINE), f"{name}: fences are made of backticks"
         n_comments = sum(COMMENT.fullmatch(line.strip()) is not None for line in text.splitlines())
         assert n_comments == sum(len(block.comments) for block in BLOCKS if block.page == name), name
+
+
+def test_the_page_of_the_installation_lists_every_extra() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    page = (ROOT / "docs" / "how-to" / "install.md").read_text("utf-8")
+    assert re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE) == sorted(project["optional-dependencies"])
 
 
 NEEDS_SERVER = "needs a server of devices"
