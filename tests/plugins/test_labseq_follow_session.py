@@ -72,7 +72,7 @@ def events(run_dir: Path) -> list[dict[str, Any]]:
 
 
 def test_the_leader_of_the_guide_drives_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _ = PROGRAMS
+    code, *_ = PROGRAMS
 
     def lead(address: str) -> None:
         exec(code.replace("5750", address.rpartition(":")[2]).replace("shots(3)", "shots(2)"), {})
@@ -94,7 +94,7 @@ def test_the_leader_of_the_guide_drives_a_run(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_the_client_of_the_guide_drives_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    _, code = PROGRAMS
+    _, code, *_ = PROGRAMS
 
     def lead(address: str) -> None:
         exec(code.replace("Leader()", f"Leader(port={address.rpartition(':')[2]})"), {})
