@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from labseq.errors import LimitError
-from labseq.model import ToneProgram
+from labseq.model import ToneProgram, TweezersFacts
 from labseq.testing import MobileTweezersContract, StaticTweezersContract
 from labseq.testing.fakes import RecordingMobileTweezers, RecordingStaticTweezers
 
@@ -56,6 +56,22 @@ class LoadsAnything(RecordingStaticTweezers):
         super().load(None)
 
 
+class TakesAnyWeights(RecordingStaticTweezers):
+    facts = TweezersFacts(shortest_release_s=0.0, control="sites")
+
+    def load(self, amplitudes: Any) -> None:
+        if amplitudes is not None:
+            raise LimitError("amplitudes of tones", "given", "None")
+        super().load(None)
+
+    def load_weights(self, weights: Any) -> None:
+        self.use("load_weights", weights)
+
+
+class RampsAnyway(RecordingStaticTweezers):
+    facts = TweezersFacts(shortest_release_s=0.0, ramps=False)
+
+
 STATIC = Planted(
     StaticTweezersContract(),
     RecordingStaticTweezers,
@@ -67,6 +83,8 @@ STATIC = Planted(
         (NormalizesInPlace, "test_loads_amplitudes"),
         (RampsBeforeItLooks, "test_refuses_what_exceeds_limits"),
         (LoadsAnything, "test_refuses_what_exceeds_limits"),
+        (TakesAnyWeights, "test_loads_weights"),
+        (RampsAnyway, "test_ramps"),
     ),
 )
 
