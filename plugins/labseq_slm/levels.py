@@ -37,7 +37,7 @@ def read_look_up_table(path: Path | None) -> NDArray[np.float64]:
         BadFileError: It is not such a file.
     """
     if path is None:
-        return np.arange(LEVELS) * (2 * math.pi / LEVELS)
+        return np.linspace(0.0, 2 * math.pi, LEVELS, endpoint=False)
     expected = f"{LEVELS} finite phases in rad, which differ"
     table = np.asarray(_array(path, expected), np.float64)
     if table.shape != (LEVELS,) or not np.isfinite(table).all() or np.ptp(table) == 0:

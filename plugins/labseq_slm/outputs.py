@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,6 @@ from labseq.plugin import Context, DeviceError
 from labseq.plugin.messages import install_hint
 from labseq_slm.optics import Optics
 from labseq_slm.settings import SlmSettings
-
-if TYPE_CHECKING:
-    from PIL import Image
 
 Levels = NDArray[np.uint8]
 
@@ -112,7 +109,7 @@ class PngFile:
 
     def __init__(self, name: str, path: Path) -> None:
         self._name, self._path = name, path
-        self._picture: type[Image.Image] | Any = None
+        self._picture: Any = None
 
     def open(self) -> None:
         """Check that the file can be written.

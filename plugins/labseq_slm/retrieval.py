@@ -50,14 +50,14 @@ class FarField:
     def __init__(self, optics: Optics, amplitude: NDArray[np.float32], step: int = 1) -> None:
         every = slice(step // 2, None, step)
         self._amplitude = amplitude[every, every] / amplitude[every, every].sum()
-        rows, columns = ((np.arange(n) - (n - 1) / 2)[every] for n in optics.pixels)
+        rows, columns = (np.linspace((1 - n) / 2, (n - 1) / 2, n)[every] for n in optics.pixels)
         self._rows = _waves(optics.row_rad, rows)
         self._columns = _waves(optics.column_rad, columns)
         self._columns_back = np.ascontiguousarray(self._columns.conj().T)
 
     def light(self, coefficients: Coefficients) -> NDArray[np.complex64]:
         """The sum of the waves to all sites, complex64 (rows, columns)."""
-        return (self._rows * coefficients[:, None]).T @ self._columns
+        return np.matmul((self._rows * coefficients[:, None]).T, self._columns, dtype=np.complex64)
 
     def at_sites(self, phasors: NDArray[np.complex64]) -> Coefficients:
         """Amplitude at each site, complex64 (n_sites,), of a phase pattern; 1 if all light went there.

@@ -126,7 +126,8 @@ def test_the_look_up_table_and_corrections_of_the_device_bring_the_light_back(tm
     Image.fromarray(np.tile(surface.astype(np.uint8), (256, 1))).save(tmp_path / "surface.bmp")
     known = {"look_up_table": tmp_path / "table.npy", "zernike": {"horizontal_coma": -0.5}}
     light = list[float]()
-    for changes in ({}, known, {**known, "correction": tmp_path / "surface.bmp"}):
+    trials: list[dict[str, Any]] = [{}, known, {**known, "correction": tmp_path / "surface.bmp"}]
+    for changes in trials:
         tweezers = made(errors=errors, **changes)
         assert not tweezers.check_settings()
         tweezers.open()
@@ -231,11 +232,12 @@ def test_files_that_are_not_what_they_should_be_are_named(tmp_path: Path) -> Non
     np.save(tmp_path / "short.npy", np.zeros(17))
     Image.fromarray(np.zeros((10, 20), np.uint8)).save(tmp_path / "small.png")
     (tmp_path / "text.png").write_text("not a picture", "utf-8")
-    for changes, message in (
-        ({"look_up_table": tmp_path / "short.npy"}, "(17,)"),
-        ({"correction": tmp_path / "small.png"}, "(10, 20)"),
-        ({"correction": tmp_path / "text.png"}, "not a picture"),
+    for setting, name, message in (
+        ("look_up_table", "short.npy", "(17,)"),
+        ("correction", "small.png", "(10, 20)"),
+        ("correction", "text.png", "not a picture"),
     ):
+        changes: dict[str, Any] = {setting: tmp_path / name}
         ((_, problem),) = made(**changes).check_settings().items()
         assert message in str(problem)
 

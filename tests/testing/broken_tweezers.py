@@ -57,7 +57,9 @@ class LoadsAnything(RecordingStaticTweezers):
 
 
 class TakesAnyWeights(RecordingStaticTweezers):
-    facts = TweezersFacts(shortest_release_s=0.0, control="sites")
+    @property
+    def facts(self) -> TweezersFacts:
+        return TweezersFacts(shortest_release_s=0.0, control="sites")
 
     def load(self, amplitudes: Any) -> None:
         if amplitudes is not None:
@@ -69,7 +71,9 @@ class TakesAnyWeights(RecordingStaticTweezers):
 
 
 class RampsAnyway(RecordingStaticTweezers):
-    facts = TweezersFacts(shortest_release_s=0.0, ramps=False)
+    @property
+    def facts(self) -> TweezersFacts:
+        return TweezersFacts(shortest_release_s=0.0, ramps=False)
 
 
 STATIC = Planted(
