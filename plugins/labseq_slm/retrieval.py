@@ -6,10 +6,10 @@ the spots are adapted to the weights (Kim et al., Opt. Lett. 44, 3178, 2019), so
 little with the weights and a calibration of the weights remains valid.
 
 The far field is summed over all pixels exactly at each site, as two products of matrices, instead of by a
-fast Fourier transform, whose grid of frequencies the sites are not on. A transform of 2,048 x 2,048 also
-takes longer for a few hundred sites. Most iterations use only each fourth pixel of rows and columns
-(Pozzi et al., Opt. Express 26, 32176, 2018), which changes the phases of the spots little. This is why the
-module does not use the retrieval of ``slmsuite``, which is made for graphics cards.
+fast Fourier transform, whose grid of frequencies the sites are not on. Most iterations use only each fourth
+pixel of rows and columns (as Pozzi et al., Opt. Express 26, 32176, 2018, who draw them at random). This is why
+the module does not use the retrieval of ``slmsuite``: it is made for graphics cards, and its fast way rounds
+sites to the grid of the transform.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ Coefficients = NDArray[np.complex64]
 """complex64 (n_sites,): amplitude and phase of the wave to each site."""
 
 SEARCH: Final = 25
-"""Iterations that find the phases of the spots: the efficiency hardly grows after them."""
+"""Iterations that find the phases of the spots (ours)."""
 ADAPT: Final = 10
-"""Iterations that adapt the amplitudes on few pixels: the spread halves with each down to 0.3 %."""
+"""Iterations that adapt the amplitudes on few pixels: 400 sites then differ by 0.3 % there, measured."""
 FINISH: Final = 3
-"""Iterations on all pixels, which leave a spread of about 0.3 %."""
+"""Iterations on all pixels: the spread there was 1.1 % in the first, and 0.2 % in the third."""
 
 
 class FarField:
