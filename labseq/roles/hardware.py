@@ -464,8 +464,7 @@ class LeaderDialogue(LeaderLink, Protocol):
         """Let the other system do a step of its own; returns the text with which it reports the end.
 
         Raises:
-            DeviceError: It is not connected, or leaves.
-            DeviceTimeoutError: It does not report the end in time.
+            TransientError: It is not connected, leaves, or does not report the end in time.
         """
         ...
 
@@ -473,7 +472,7 @@ class LeaderDialogue(LeaderLink, Protocol):
         """Have it turn the imaging light on; returns once the light is on.
 
         Raises:
-            DeviceError: As for a step.
+            TransientError: As for a step.
         """
         ...
 

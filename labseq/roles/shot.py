@@ -270,7 +270,7 @@ class Shot(Protocol):
 
         Raises:
             ConfigError: There is no such device.
-            DeviceError: It is not connected, leaves, or is not done in time.
+            TransientError: It is not connected, leaves, or is not done in time.
         """
         ...
 

@@ -14,6 +14,7 @@ from labseq.plugin import (
     DeviceTimeoutError,
     LabseqError,
     ShotAbortedError,
+    TransientError,
     format_quantity,
     wait_for,
 )
@@ -194,9 +195,7 @@ class LeaderDevice(Device):
         """Let the control system do a step of its own; see ``labseq.plugin.LeaderDialogue``.
 
         Raises:
-            DeviceError: None is connected, or it left.
-            DeviceTimeoutError: It was not done in time.
-            ShotAbortedError: It aborted the shot.
+            TransientError: None is connected, it left or aborted the shot, or it was not done in time.
         """
         self._request("your", {"step": step, "shot": shot, "timeout_s": timeout_s}, "done", timeout_s)
         try:
@@ -210,8 +209,7 @@ class LeaderDevice(Device):
         """Have the control system turn the imaging light on; see ``labseq.plugin.LeaderDialogue``.
 
         Raises:
-            DeviceError: None is connected, or it left.
-            DeviceTimeoutError: The light was not on in time.
+            TransientError: As for a step.
         """
         limit_s = self._settings.light_timeout
         self._request("light", {"exposure_s": exposure_s, "shot": shot}, "lit", limit_s)
@@ -309,7 +307,7 @@ class LeaderDevice(Device):
             self._await_reply("its imaging light may be on", self._settings.light_timeout)
         with self._changed:
             if self._link.listens and not self._dialogue.is_connected:
-                raise DeviceError(self._name, f"no leader is connected that could answer '{word}'")
+                raise self._unanswered(f"no leader is connected that could answer '{word}'")
             self._send(self._dialogue.request(word, facts, reply, self._link.now()))
         if simulated := self._link.arrange_reply(reply, longest_s):
             self._handle(("came", simulated))
@@ -318,7 +316,15 @@ class LeaderDevice(Device):
         """Wait for the reply that was asked for."""
         if wait_for(self._replied, timeout_s, self._context.clock) is None:
             text = f"{otherwise}: the leader has not answered within {format_quantity(timeout_s, 'time')}"
-            raise DeviceTimeoutError(self._name, text, timeout_s)
+            raise self._unanswered(text)
+
+    def _unanswered(self, text: str) -> TransientError:
+        """The error for a leader that does not do its part: the machine has not failed, and the run goes on.
+
+        A shot that a leader began is repeated at its next `go`; any other one as its policy says.
+        """
+        kind = ShotAbortedError if self._dialogue.state == "busy" else TransientError
+        return kind(text, self._name)
 
     def _replied(self, longest_s: float) -> bool | None:
         with self._changed:
@@ -327,7 +333,7 @@ class LeaderDevice(Device):
             if self._dialogue.is_aborted:
                 raise ShotAbortedError("the leader aborted the shot", self._name)
             if self._link.listens and not self._dialogue.is_connected:
-                raise DeviceError(self._name, "the leader left before it answered")
+                raise self._unanswered("the leader left before it answered")
             self._changed.wait(longest_s)
             return None
 

@@ -47,14 +47,14 @@ class SpeakingLeader(RecordingLeader):
 
     def __init__(self, context: Context, calls: Any) -> None:
         super().__init__(context, calls)
-        self.values: list[dict[str, str]] = []
+        self.sent: list[dict[str, str]] = []
         self.told: list[Any] = []
 
     def expect_values(self, check: Any) -> None:
         self.check = check
 
     def take_values(self) -> dict[str, str]:
-        return self.values.pop(0) if self.values else {}
+        return self.sent.pop(0) if self.sent else {}
 
     def take_turn(self, step: str, timeout_s: float, shot: int) -> str:
         raise DeviceTimeoutError(self.name, f"'{step}' of shot {shot} is not done", timeout_s)
@@ -73,7 +73,7 @@ def test_an_edge_at_one_device_takes_the_values_that_another_one_has_sent() -> N
     made = rig(("wait", FollowStep("go", 10.0, "leader")), IMAGE)
     speaking = SpeakingLeader(Context("artiq", clock=made.lab.clock), made.lab.calls)
     object.__setattr__(made.lab, "devices", {**made.lab.devices, "artiq": speaking})
-    speaking.values = [{"x": "1"}, {"x": "many"}, {"x": "2"}]
+    speaking.sent = [{"x": "1"}, {"x": "many"}, {"x": "2"}]
     sequencer = made.sequencer
     base = ShotSettings(made.lab, sequencer._steps, sequencer._timelines, {"x": 0})
 
