@@ -193,6 +193,8 @@ class Dialogue:
 
     def report(self, state: str, about: About, now_s: float) -> tuple[str, list[str]]:
         """The shot of a `go` is over: the answer (``labseq.plugin.LeaderLink.report``) and lines to send."""
+        if state == "failed":
+            self.awaited = ""  # else the next shot would wait for this reply before its own `go`
         if self._go is None or not self._go.taken:
             return "", self._tell(state, about, now_s)
         late = self.overdue(now_s)
