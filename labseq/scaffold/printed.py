@@ -149,6 +149,7 @@ COLUMNS: Final[Mapping[str, str]] = {
     "two channels": "what is rendered, for both channels of the AWG",
     "Gsample/s": "samples rendered per second, in thousand millions",
     "playing/rendering": "time of playing the samples over that of rendering them",
+    "answers": "what labseq answered to a control system that leads",
     "attempts": "how often a shot is tried",
     "device call": "longest time that a call of a device may take",
     "not opened": "devices that the check has not opened",

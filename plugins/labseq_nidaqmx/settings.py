@@ -41,7 +41,8 @@ class NidaqmxSettings(Settings):
     """Lines on cards of National Instruments."""
 
     driver: Literal["installed", "simulated"] = Field(
-        default="installed", description="`simulated`: a library with simulated cards in place of NI-DAQmx"
+        default="installed",
+        description="with `simulated`, simulated cards in place of NI-DAQmx",
     )
     rate: Annotated[Frequency, Field(gt=0)] = Field(
         default=1e6,

@@ -15,14 +15,14 @@ PixelCount: TypeAlias = Annotated[int, Field(ge=64, le=4320)]
 class ZernikeSettings(Settings):
     """Phases that correct aberrations: r.m.s. of each Zernike mode over the circle within the pixels."""
 
-    defocus: Angle = Field(default=0.0, description="Z(2, 0)")
-    oblique_astigmatism: Angle = Field(default=0.0, description="Z(2, -2), axes at 45 degrees")
-    vertical_astigmatism: Angle = Field(default=0.0, description="Z(2, 2), axes along rows and columns")
-    vertical_coma: Angle = Field(default=0.0, description="Z(3, -1)")
-    horizontal_coma: Angle = Field(default=0.0, description="Z(3, 1)")
-    vertical_trefoil: Angle = Field(default=0.0, description="Z(3, -3)")
-    oblique_trefoil: Angle = Field(default=0.0, description="Z(3, 3)")
-    spherical: Angle = Field(default=0.0, description="Z(4, 0)")
+    defocus: Angle = Field(default=0.0, description="term Z(2, 0)")
+    oblique_astigmatism: Angle = Field(default=0.0, description="term Z(2, -2), axes at 45 degrees")
+    vertical_astigmatism: Angle = Field(default=0.0, description="term Z(2, 2), axes along rows and columns")
+    vertical_coma: Angle = Field(default=0.0, description="term Z(3, -1)")
+    horizontal_coma: Angle = Field(default=0.0, description="term Z(3, 1)")
+    vertical_trefoil: Angle = Field(default=0.0, description="term Z(3, -3)")
+    oblique_trefoil: Angle = Field(default=0.0, description="term Z(3, 3)")
+    spherical: Angle = Field(default=0.0, description="term Z(4, 0)")
 
 
 class SimulatedErrors(Settings):
@@ -52,7 +52,7 @@ class SlmSettings(Settings):
     )
     display: int = Field(default=1, ge=0, description="number of the display; 0 is usually the main screen")
     image: FilePath | None = Field(
-        default=None, description="PNG file for `output: file`, replaced at each change"
+        default=None, description="picture (PNG) for `output: file`, replaced at each change"
     )
     pixels: tuple[PixelCount, PixelCount] = Field(
         default=(1024, 1272), description="rows and columns of pixels"
@@ -67,14 +67,14 @@ class SlmSettings(Settings):
     beam_waist: PositiveLength = Field(default=4.5e-3, description="1/e^2 radius of the light on the SLM")
     offset: tuple[Length, Length] = Field(
         default=(120e-6, 0.0),
-        description="(x, y) from the zeroth order, which receives the light that is not diffracted, to the "
-        "middle of the grid, in the atom plane",
+        description="vector (x, y) from the zeroth order, which receives the light that is not diffracted, "
+        "to the middle of the grid, in the atom plane",
     )
     rotation: Angle = Field(default=0.0, description="of the pixels against the grid, clockwise")
     mirrored: bool = Field(default=False, description="whether the optics mirror left and right")
     look_up_table: FilePath | None = Field(
         default=None,
-        description=".npy file of 256 phases in rad, those of the grey levels 0 to 255; none: they rise "
+        description="file (.npy) of 256 phases in rad, those of the grey levels 0 to 255; none: they rise "
         "linearly by 2 pi / 256 from level to level",
     )
     correction: FilePath | None = Field(
