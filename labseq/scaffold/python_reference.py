@@ -22,6 +22,7 @@ from labseq.scaffold.words import docstring, summary
 
 SCRIPTS: Final = (
     "open_run",
+    "serve",
     "make_planner",
     "make_target",
     "check_plan",
