@@ -14,10 +14,12 @@ from labseq.assembly.plugin_choice import (
     construct_target,
     dump,
     load_plugins,
+    make_step,
+    place_note,
     read_settings,
     resolve,
 )
-from labseq.assembly.point import Point, make_step, place_note
+from labseq.assembly.point import Point
 from labseq.assembly.profile import ResolvedProfile, resolve_profile
 from labseq.config.addresses import PROFILE, PROFILE_ROLES, split_overrides
 from labseq.config.document import Document, StoredText, plugin_paths

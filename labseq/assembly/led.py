@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from labseq.assembly.assemble import make_target
-from labseq.assembly.point import Configured, Point
+from labseq.assembly.plugin_choice import Configured
+from labseq.assembly.point import Point
 from labseq.assembly.points import ScanPoints
 from labseq.assembly.profile import ResolvedProfile
 from labseq.config.addresses import find

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from labseq import builtin as builtins
 from labseq.config import addresses
@@ -27,8 +27,14 @@ from labseq.model import ScanSpace, SiteGrid, TargetPattern
 from labseq.plugins.calls import call_plugin
 from labseq.plugins.host import PluginHost
 from labseq.registry import LOAD_S, Entry
-from labseq.roles import Context
-from labseq.settings import Choice, NoSettings, Settings
+from labseq.roles import Context, Step
+from labseq.settings import Choice, NoSettings, Settings, settings_of
+
+if TYPE_CHECKING:
+    from labseq.assembly.profile import ResolvedProfile
+    from labseq.config.sequence import StepSpec
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -81,6 +87,13 @@ class ChosenPlugin:
             return error
         within = error.setting if isinstance(error, LimitError) else ()
         return self.document.error((*self.loc, *within), str(error))
+
+
+class Configured(NamedTuple, Generic[T]):
+    """A planner or step, and its settings after defaults, SI, JSON-ready."""
+
+    plugin: T
+    dump: Mapping[str, Any]
 
 
 def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> ChosenPlugin:
@@ -239,6 +252,59 @@ def construct_target(chosen: ChosenPlugin, grid: SiteGrid) -> TargetPattern:
         came = "" if isinstance(target, TargetPattern) else f", but {_called(target)}"
         raise entry.owner.fault(f"pattern '{entry.name}' made no TargetPattern of shape {grid.shape}{came}")
     return target
+
+
+def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> Configured[Step]:
+    """A step of a sequence, and its settings for the record.
+
+    Raises:
+        ConfigError: The step is unknown, its settings are invalid, or the profile lacks the device that it
+            names; with their place.
+    """
+    entry = find_entry(hardware.host, document, "step", spec.kind, spec.loc, key=True)
+    _check_indentation(document, spec, entry)
+    settings = read_settings(document, entry, spec.loc)
+    try:
+        step, dumped = construct_role(entry, settings), dump(entry, settings)
+    except (ConfigError, PluginLoadError) as error:
+        raise document.error(spec.loc, str(error)) from error
+    if step.device_setting and (name := getattr(settings, step.device_setting, None)) is not None:
+        _check_device(hardware, document, spec, step, name)
+    return Configured(step, dumped)
+
+
+def _check_indentation(document: Document, spec: StepSpec, entry: Entry) -> None:
+    """Raise for keys of the item of the list that are indented as settings of the step are."""
+    settings = {setting.key for setting in settings_of(entry.settings_model)}
+    for key in ("name", "policy"):
+        if key not in settings and document.root.at((*spec.loc, key)) is not None:
+            what = f"'{key}' is in the settings of '{spec.kind}'"
+            hint = f"write '{key}' on a line of its own below"
+            raise document.error((*spec.loc, key), what, f"'{key}' beside '{spec.kind}'", hint, key=True)
+
+
+def _check_device(
+    hardware: ResolvedProfile, document: Document, spec: StepSpec, step: Step, name: str
+) -> None:
+    """Raise if the profile lacks the device that a step names, or if the step cannot use it."""
+    devices = hardware.profile.devices
+    if step.device_may_be_camera:
+        known = ["camera", *devices]
+    else:
+        known = [device for device, choice in devices.items() if choice.role == "device"]
+    if name in known:
+        return
+    what = f"the profile '{hardware.profile.name}' has no device '{name}'"
+    if name in devices:
+        what = f"'{name}' is a camera, which '{spec.kind}' cannot use"
+    problem = document.problem((*spec.loc, step.device_setting), what, one_of(sorted(known)))
+    raise ConfigError(replace(problem, notes=(place_note(hardware.document, "devices"),)))
+
+
+def place_note(document: Document, key: str) -> str:
+    """The note of a problem that names the place of a key in the other file."""
+    line, column = document.locate((key,), key=True)
+    return f"see '{key}' at {document.path}:{line}:{column}"
 
 
 def check_role(entry: Entry, instance: object) -> None:

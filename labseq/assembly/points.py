@@ -15,8 +15,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from labseq.assembly.lab import construct, parallelism_of
-from labseq.assembly.plugin_choice import resolve
-from labseq.assembly.point import Configured, Point, make_step
+from labseq.assembly.plugin_choice import Configured, make_step, resolve
+from labseq.assembly.point import Point
 from labseq.assembly.profile import ResolvedProfile, choose
 from labseq.config.addresses import PROFILE, PROFILE_ROLES, VARIABLES
 from labseq.config.profile import MobileTweezersChoice

@@ -340,14 +340,14 @@ def load_sequence(
     """
     document = Document.read(path, kept)
     check_kind(document, "sequence")
-    if document.data.get("planner") is None:
+    if document.get(("planner",)) is None:
         # as an override, so that a message about it names no place in the file
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
     with collecting(problems) as collector:
         document = document.override_all(overrides, collector, may_add=("policy",)).evaluated()
         scan: Scan | None = None
         # before the values of the file are checked: those of the first point take the place of some
-        if document.data.get("scan") is None:
+        if document.get(("scan",)) is None:
             _refuse_without_scan(document, collector)
         else:
             from labseq.config.scan import load_scan  # a sequence without a scan does not need it
