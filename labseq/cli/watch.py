@@ -17,7 +17,6 @@ from labseq.data.follower import Follower
 from labseq.data.reader import open_run
 from labseq.files import data_root
 from labseq.recording.listing import newest_run
-from labseq.session.stopping import is_running
 
 
 def watch_run(
@@ -41,7 +40,7 @@ def watch_run(
                 wait(0.5)
             _watch_one(run_dir := newest, shown, wait)
     except KeyboardInterrupt:
-        state = "continues" if is_running(run_dir) else "is over"
+        state = "is over" if Follower(run_dir).is_over else "continues"
         say(f"no longer watched; the run {run_dir} {state}", stream=shown)
 
 
