@@ -139,6 +139,7 @@ def assemble(
         PluginLoadError: A named plugin failed to load.
     """
     profile, dry_run = options.profile, options.dry_run
+    # a kept text needs no file: it may be gone by now
     sequence_path = sequence_path if kept is not None else find_sequence(sequence_path)
     for_sequence, for_profile = split_overrides(options.overrides)
     profile_set = [override._replace(address=f"{PROFILE}{override.address}") for override in for_profile]
@@ -318,7 +319,7 @@ def make_target(
         chosen = resolve(hardware.host, document, "pattern", choice)
         try:
             target = construct_target(chosen, grid)
-        except PluginLoadError:
+        except PluginLoadError:  # names the plugin at fault; no value of the file is wrong
             raise
         except LabseqError as error:
             note = (

@@ -93,6 +93,7 @@ class LedPoints(ScanPoints):
         """Planner, steps and target by the place of their settings."""
         problems, plugins = ProblemCollector(), dict[Loc, Configured[Any]]()
         with problems:
+            # not super() alone: with slots, dataclass replaces the class that it would refer to
             plugins = super(LedPoints, self)._planner_and_steps(document)
         with problems:
             key = _TARGET, repr(document.get(_TARGET))

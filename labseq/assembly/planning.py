@@ -215,6 +215,7 @@ def _planner(host: PluginHost, request: PlanRequest, settings: Sequence[Override
     for setting in settings:
         address = f"planner.{setting.address.removeprefix('planner.')}"
         overrides.append(Override(address, setting.value, setting.source))
+    # a document of options, so that a message names the option that is wrong
     document = Document.of_options(overrides, "the command line")
     return resolve(host, document, "planner", Choice(use=request.planner).placed("planner"))
 

@@ -74,6 +74,7 @@ class ChosenPlugin:
             identities = None if self.settings is None else self.settings.identities()
         if identities is not None:
             return tuple(map(str, identities))
+        # a driver that does not say which device it uses: one run at a time on the profile
         return (f"{role} of {'' if self.document is None else self.document.path.resolve()}",)
 
     def dump(self) -> dict[str, Any]:
@@ -233,7 +234,7 @@ def construct_role(entry: Entry, *arguments: Any) -> Any:
 
     def make() -> Any:
         instance = entry.factory(*arguments)
-        check_role(entry, instance)
+        check_role(entry, instance)  # in the guarded call, because attributes of a plugin may raise
         return instance
 
     return call_plugin(entry.owner, f"the constructor of {entry.kind} '{entry.name}'", make)

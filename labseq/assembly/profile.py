@@ -177,6 +177,7 @@ def resolve_profile(
         problems=problems,
         kept=None if recorded is None else recorded.profile,
     )
+    # of two plugins of one name the first is loaded
     folders = [*plugin_folders, *plugin_paths(document, spec.plugin_folders)]
     host = load_plugins(folders, max_wait_s=spec.timeouts.load_s)
     pins = None if recorded is None else recorded.calibrations

@@ -44,6 +44,7 @@ def readings_of(
         polled: Collection[str] | None = getattr(plugin.settings, "polled", None)
         if polled is not None:
             yield from (f"{_READING}{name}.{value}" for value in polled)
+        # a factory that is a function does not tell whether its driver has a poll() of its own
         elif not isinstance(factory, type) or getattr(factory, "poll", None) is not Hardware.poll:
             yield f"{_READING}{name}."
     if "simulation" in hardware.chosen:

@@ -50,7 +50,7 @@ def _pattern(hardware: ResolvedProfile, document: Document, loc: Loc) -> Occupan
     chosen = resolve(hardware.host, document, "pattern", choice)
     try:
         return construct_target(chosen, hardware.grid).fill
-    except PluginLoadError:
+    except PluginLoadError:  # names the plugin at fault; no value of the file is wrong
         raise
     except LabseqError as error:
         raise document.error(loc, str(error)) from error

@@ -179,6 +179,7 @@ def make_search(
     chosen: ChosenPlugin | None = None
     with problems:
         chosen = resolve(corners.hardware.host, document, "scanner", choice)
+    # the first corner has the lower end of every range, the last one the upper end
     low = corners.at(0).parameters
     high = corners.at(math.prod(scan.shape) - 1).parameters
     ranges: list[ScanRange] = []

@@ -130,6 +130,7 @@ def entries(root: Path, names: Iterable[tuple[str, str]], words: Sequence[str] =
                 from labseq.data.described import read_entry  # with numpy, which kept entries do without
 
                 entry = read_entry(Path(folder))
+                # a run in progress may die, which changes none of its files
                 if stamp and entry.status != "running":
                     new[key] = Kept(stamp, entry.text, json.dumps({**asdict(entry), "path": ""}))
             if _contains(entry.text, words):

@@ -82,6 +82,7 @@ class RunEntry:
     @property
     def values(self) -> dict[str, Any]:
         """Every value that a condition can name: results, settings, "shots", "n_shots"; SI."""
+        # reversed: of two results with one name the first counts, which is the more important one
         results = {result.name: result.value.value for result in reversed(self.results)}
         counts = {"shots": self.shots, "n_shots": self.n_shots}
         return {

@@ -124,6 +124,7 @@ def _in_index(name: str, row: IndexRow, target: TargetPattern) -> Events | None:
         return None
     if not math.isnan(row.filling_fraction):
         return (row.filling_fraction if name == "filling" else float(bool(row.success))), 1
+    # no image step has judged the shot: its last image, that of a cycle, counts
     if not len(row.images):
         return None
     n_defects, n_surplus = row.images.n_defects[-1], row.images.n_surplus[-1]

@@ -76,7 +76,7 @@ def site_map(run: Run, name: str, shots: Sequence[Shot] | None = None) -> SiteMa
     Raises:
         ConfigError: The run has no such quantity, or it is not one of sites.
     """
-    find_quantity(run, name)
+    find_quantity(run, name)  # raises for a name that the run does not have
     if parse_name(name).kind not in OF_IMAGES:
         problem = f"'{clean(name)}' has one value in each shot, and none for a site"
         raise ConfigError(Problem(problem, clean(run.path.name), expected=f"one of {', '.join(OF_IMAGES)}"))

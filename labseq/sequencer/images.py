@@ -52,7 +52,7 @@ def take_frame(
         if trigger == "software":
             call(name, limit_s, camera.trigger)
         else:
-            arm()
+            arm()  # only now: the internal trigger starts the exposure at once
         frame = call(name, limit_s + DRIVER_MARGIN_S, camera.read, limit_s)
     return as_frame(name, frame)
 

@@ -84,7 +84,7 @@ class LeaderAnswers:
             settings, before = self._check(values), self.shot.lab.random_streams
             self.shot.use(settings)
             for stream in settings.lab.random_streams:
-                if stream not in before:
+                if stream not in before:  # the others began this shot before its first step
                     stream.begin_shot(self.shot.index, self.shot.record.attempt)
         self._values = values
 

@@ -383,6 +383,7 @@ class Sequencer:
         Raises:
             OverBudgetError: It took longer than its budget, and the run's policy is to stop.
         """
+        # a shot that is on the disk is neither repeated nor skipped: these reactions become a warning
         then = self._policy.otherwise.over_budget
         stages.policy = StepPolicy(over_budget=then if then in (None, "record", "stop") else "warn")
         stages.done("write", 0.0 if self.lab.clock.virtual else host_s, host_s, math.nan, 0)

@@ -182,9 +182,8 @@ class Stages:
         text = f"'{timing.stage}' took {took}; its budget is {budget}"
         if then != "warn":
             raise OverBudgetError(text, then)
-        self._is_warned = (
-            True  # the stages around it, and the step, are over their budgets for the same reason
-        )
+        # the stages around it, and the step, are over their budgets for the same reason
+        self._is_warned = True
         self._emit("warning", {"text": f"shot {self._record.shot_index}: {text}"})
 
 

@@ -135,7 +135,7 @@ class AskedShots(BackgroundRun):
             raise ConfigError("the sequence has a scan, which run() takes; shot() takes one shot at a time")
         self._led: LedPoints | None = session.assembly.led
         self._first: Point = session.assembly.first_point
-        self._checked = {id(self._first)}
+        self._checked = {id(self._first)}  # the run checks that one before it opens the devices
         self._asked = queue.SimpleQueue[Point | None]()
         self._results = queue.SimpleQueue[ShotResult | None]()
         self._has_begun = False

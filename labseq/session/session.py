@@ -400,12 +400,11 @@ class Session(PreparedRun):
     def _checked(self, first: Point) -> tuple[Lab, list[str]]:
         """Check the run and compile its kernels; returns the devices of the first shot, and warnings."""
         warnings = [str(problem) for problem in check(self, runs=True).warnings]
-        # once more: what the check has rehearsed used up random numbers and the states of simulated devices
-        # those of other points, too: a kernel that is compiled between two shots would hold up the run
         points = {point.lab_key: point for point in self.points.known(self.history).values()}
         points.pop(first.lab_key, None)
+        # built again: the rehearsal used up random numbers and changed the states of simulated devices
         self.warm(lab := self.build_lab(first))
-        for point in points.values():
+        for point in points.values():  # a kernel that is compiled between two shots would hold up the run
             self.warm(self.build_lab(point))
         return lab, warnings
 
@@ -464,6 +463,7 @@ class Session(PreparedRun):
         """Mark that devices may be on, so that the next run makes them safe if this process dies."""
         profile = self.assembly.hardware
         try:
+            # without real devices nothing can be left on, and a mark that fails must not end the run
             with nullcontext() if profile.identities else suppress(RecordingError):
                 mark_active(self._profile_key, profile.identities, run_dir)
             yield
