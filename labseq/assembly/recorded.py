@@ -13,6 +13,7 @@ from labseq.calibration_store import read_entry
 from labseq.config.document import StoredText
 from labseq.config.profile import GridSettings
 from labseq.config.validation import validate_values
+from labseq.data.lab_models import plugin_folders_of
 from labseq.data.reader import Run
 from labseq.data.shot import Shot
 from labseq.errors import RecordingError
@@ -22,7 +23,7 @@ from labseq.plugins.host import PluginHost
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE
 from labseq.recording.run_file import sha256_of_text
 from labseq.roles import Context
-from labseq.settings import path_beside, settings_of
+from labseq.settings import settings_of
 
 
 def resolved_of(run: Run) -> dict[str, Any]:
@@ -46,6 +47,7 @@ def stored_text(path: Path, sha256: str) -> StoredText:
     Raises:
         RecordingError: It is missing or has been changed.
     """
+    # as encode_text wrote it: a comment in the file may hold bytes that are not UTF-8
     text = read_file(path).decode("utf-8", "surrogateescape")
     if sha256_of_text(text) != sha256:
         raise RecordingError(path, f"is not what {RUN_FILE} says it was", "restore it from a backup")
@@ -90,15 +92,8 @@ def plugins_of(run: Run) -> PluginHost:
         ConfigError: A folder no longer exists.
         RecordingError: run.json lacks the plugin folders.
     """
-    resolved = resolved_of(run)
-    named = (("profile_path", resolved["profile"]), ("sequence_path", resolved))
-    return load_plugins(
-        [
-            path_beside(Path(run.record[path]).parent, folder)
-            for path, settings in named
-            for folder in settings.get("plugin_folders", ())
-        ]
-    )
+    resolved_of(run)  # raises if run.json lacks the settings
+    return load_plugins(plugin_folders_of(run))
 
 
 def calibrations_of(run: Run) -> dict[str, CalibrationEntry]:

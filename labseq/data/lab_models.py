@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,12 +15,14 @@ from labseq.data.fit_models import MODELS, Points, Solution
 from labseq.data.least_squares import Floats
 from labseq.data.reader import Run
 from labseq.errors import ConfigError, PluginLoadError, Problem, UnknownPluginError, one_of
+from labseq.files import PLUGINS
 from labseq.messages import clean, did_you_mean
 from labseq.model.estimate import Estimate
 from labseq.plugins.calls import call_plugin
 from labseq.plugins.host import PluginHost
 from labseq.registry import Entry
 from labseq.settings import path_beside
+from labseq.text_files import is_folder
 
 T = TypeVar("T")
 
@@ -110,7 +112,7 @@ def find_lab_model(run: Run, name: str) -> LabModel:
     """
     host = PluginHost(MAX_WAIT_S)
     host.load_entry_points()
-    host.load_folders(_plugin_folders(run))
+    host.load_folders(plugin_folders_of(run))
     try:
         return lab_model_of(host, name)
     except UnknownPluginError as error:
@@ -153,14 +155,17 @@ def _made(entry: Entry) -> LabModel:
     )
 
 
-def _plugin_folders(run: Run) -> Sequence[Path]:
+def plugin_folders_of(run: Run) -> list[Path]:
+    """The plugin folders of a run's sequence, then those of its profile, as the run has loaded them."""
     resolved: Mapping[str, Any] = run.record.get("resolved") or {}
-    named = (("profile_path", resolved.get("profile") or {}), ("sequence_path", resolved))
-    return [
-        path_beside(Path(run.record[path]).parent, folder)
+    named = (("sequence_path", resolved), ("profile_path", resolved.get("profile") or {}))
+    paths = [
+        (folder, path_beside(Path(run.record[path]).parent, folder))
         for path, settings in named
         for folder in settings.get("plugin_folders", ())
     ]
+    # every file that `labseq new` makes names this folder, which need not exist
+    return [path for folder, path in paths if folder != PLUGINS or is_folder(path)]
 
 
 def _called(entry: Entry, work: Callable[[], T]) -> T:

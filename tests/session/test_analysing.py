@@ -60,7 +60,7 @@ SEQUENCE = """labseq: 1
 name: analysed
 shots: 3
 seed: 5
-plugin_folders: [mine]
+plugin_folders: [plugins, mine]
 target: {pattern: compact, rows: 5, cols: 5}
 record_frames: none
 shot:
