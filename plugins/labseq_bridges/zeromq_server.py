@@ -1,11 +1,12 @@
 """A ZeroMQ socket (REP) of labseq: `python -m labseq_bridges.zeromq_server`. It needs pyzmq.
 
-Each request is a JSON object with the token, and gets one answer, a JSON object:
+A peer connects with ZeroMQ's mechanism PLAIN; the user name is `labseq`, the password the token. libzmq
+refuses any other peer before it keeps a message. Each request is a JSON object and gets one answer:
 
-    {"token": "...", "request": "go", "text": "run 17", "values": {"planner.degree_of_parallelism": 5}}
-    {"token": "...", "request": "wait", "timeout_s": 2.5}
-    {"token": "...", "request": "abort"}
-    {"token": "...", "request": "state"}
+    {"request": "go", "text": "run 17", "values": {"planner.degree_of_parallelism": 5}}
+    {"request": "wait", "timeout_s": 2.5}
+    {"request": "abort"}
+    {"request": "state"}
 
 `go` is answered {"answer": "busy"}, `wait` and `abort` with what labseq says of the shot. If the shot has not
 ended within `timeout_s`, `wait` is answered "busy", so that another request can come in between. A request
@@ -15,11 +16,10 @@ that is refused is answered {"answer": "error", "reason": "..."}.
 from __future__ import annotations
 
 import argparse
-import hmac
 import json
 import sys
 from collections.abc import Sequence
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from typing import Any
 
 from labseq_client import LabseqError
@@ -28,6 +28,8 @@ from labseq_bridges.link import Link, add_arguments, link_of, plain
 
 LONGEST = 65536
 """Longest request in bytes; ZeroMQ disconnects a peer that sends more."""
+HANDSHAKE_MS = 2000
+"""Longest time until a peer has shown the token, in milliseconds."""
 MAX_WAIT_S = 3600.0
 KEYS: dict[str, set[str]] = {"go": {"text", "values"}, "wait": {"timeout_s"}, "abort": set(), "state": set()}
 
@@ -36,23 +38,22 @@ class RequestError(Exception):
     """A request that labseq is not asked; the text is the reason."""
 
 
-def answer_to(message: bytes, link: Link, token: str) -> dict[str, Any]:
+def answer_to(message: bytes, link: Link) -> dict[str, Any]:
     """The answer to a request."""
     try:
-        request = _checked(message, token)
+        request = _checked(message)
         return _asked(request, link)
     except (RequestError, LabseqError, RuntimeError, OSError, ValueError, LookupError) as error:
         return {"answer": "error", "reason": str(error) or type(error).__name__}
 
 
-def _checked(message: bytes, token: str) -> dict[str, Any]:
+def _checked(message: bytes) -> dict[str, Any]:
     try:
         request = json.loads(message)
     except (ValueError, RecursionError):
         raise RequestError("the request is not JSON") from None
-    given = request.pop("token", None) if isinstance(request, dict) else None
-    if not isinstance(given, str) or not hmac.compare_digest(given.encode(errors="replace"), token.encode()):
-        raise RequestError("the request must be an object with the right 'token'")
+    if not isinstance(request, dict):
+        raise RequestError("the request is not a JSON object")
     name = request.pop("request", None)
     if not isinstance(name, str) or name not in KEYS:
         raise RequestError(f"request is {str(name)[:40]!r}; expected {', '.join(KEYS)}")
@@ -87,18 +88,19 @@ def _timeout_s(given: Any) -> float | None:
     return max(0.001, given)
 
 
-def serve(socket: Any, link: Link, token: str) -> None:
+def serve(socket: Any, link: Link) -> None:
     """Answer requests one after the other, until an exception such as KeyboardInterrupt."""
     while True:
         if not socket.poll(200):  # Ctrl-C does not end a call that has just begun to receive
             continue
         parts = socket.recv_multipart()
-        socket.send(json.dumps(answer_to(b"".join(parts), link, token)).encode())
+        socket.send(json.dumps(answer_to(b"".join(parts), link)).encode())
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the server until Ctrl-C."""
     import zmq
+    from zmq.auth.thread import ThreadAuthenticator
 
     parser = argparse.ArgumentParser(description="ZeroMQ REP socket of labseq")
     parser.add_argument(
@@ -108,11 +110,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add_arguments(parser)
     options = parser.parse_args(arguments)
     link = link_of(options)
-    with zmq.Context() as context, context.socket(zmq.REP) as socket:
+    with zmq.Context() as context, context.socket(zmq.REP) as socket, ExitStack() as stack:
         socket.maxmsgsize = LONGEST
         socket.linger = 0
+        socket.handshake_ivl = HANDSHAKE_MS
+        # the number of parts of a message has no limit, so only peers with the token may send messages
+        socket.plain_server = True
+        guard = ThreadAuthenticator(context)
+        guard.start()
+        stack.callback(guard.stop)
         try:
-            token = link.token()
+            guard.configure_plain(passwords={"labseq": link.token()})
             socket.bind(f"tcp://{options.bind}:{options.port}")
         except (OSError, zmq.ZMQError) as error:
             parser.error(f"{error}; see --labseq-token, --bind and --port")
@@ -120,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.stdout.write(f"listening on {address}\n")
         sys.stdout.flush()
         with suppress(KeyboardInterrupt), closing(link):
-            serve(socket, link, token)
+            serve(socket, link)
 
 
 if __name__ == "__main__":

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,9 @@ class Requests:
     """A REQ socket of another program."""
 
     def __init__(self, context: zmq.Context[Any], address: str) -> None:
+        self.address = address
         self._socket = context.socket(zmq.REQ)
+        self._socket.plain_username, self._socket.plain_password = b"labseq", TOKEN.encode()
         self._socket.rcvtimeo = int(1000 * MAX_WAIT_S)
         self._socket.linger = 0
         self._socket.connect(address)
@@ -38,7 +41,7 @@ class Requests:
         return json.loads(self._socket.recv())
 
     def ask(self, request: Any, **values: Any) -> Any:
-        return self.send(json.dumps({"token": TOKEN, "request": request, **values}).encode())
+        return self.send(json.dumps({"request": request, **values}).encode())
 
     def close(self) -> None:
         self._socket.close()
@@ -109,9 +112,8 @@ def test_what_it_refuses() -> None:
     with served(free_port()) as peer:
         for text in (b"", b"\xff\x00", b"[" * 60_000, b"go"):
             assert reason(peer.send(text)) == "the request is not JSON"
-        for request in ([], None, {"request": "go"}, {"token": "x", "request": "go"}, {"token": 1}):
-            expected = "the request must be an object with the right 'token'"
-            assert reason(peer.send(json.dumps(request).encode())) == expected
+        for text in (b"[]", b"null", b'"go"'):
+            assert reason(peer.send(text)) == "the request is not a JSON object"
         assert reason(peer.ask("run")) == "request is 'run'; expected go, wait, abort, state"
         assert reason(peer.ask("go", text="1", cycles=3)).startswith("unknown key 'cycles'; 'go' takes")
         assert reason(peer.ask("go", values=[1])) == "values must be an object: address -> value"
@@ -125,6 +127,38 @@ def test_a_peer_that_sends_too_much_gets_no_answer() -> None:
         peer._socket.rcvtimeo = 300
         with pytest.raises(zmq.Again):
             peer.send(b" " * 70_000)
+
+
+def greeting(mechanism: bytes) -> bytes:
+    """The first bytes of ZMTP 3.0."""
+    return b"\xff" + bytes(8) + b"\x7f\x03\x00" + mechanism.ljust(20, b"\0") + bytes(32)
+
+
+PART = b"\x03" + (60_000).to_bytes(8, "big") + bytes(60_000)
+PART_2 = b"\xff" + (60_001).to_bytes(8, "big") + b"\x01" + bytes(60_000)
+NO_TOKEN = {
+    "nothing": (b"", b""),
+    "the mechanism NULL": (greeting(b"NULL") + b"\x04\x19\x05READY\x0bSocket-Type\0\0\0\x03REQ", PART),
+    "a wrong token": (greeting(b"PLAIN") + b"\x04\x0f\x05HELLO\x06labseq\x01x", PART),
+    "a user of another name": (greeting(b"PLAIN") + b"\x04\x29\x05HELLO\x01x\x20" + TOKEN.encode(), PART),
+    "the protocol of ZeroMQ 2": (b"\x01\x00", PART_2),
+}
+
+
+def test_a_peer_without_the_token_cannot_send_parts_without_end() -> None:
+    with served(free_port()) as peer:
+        host, _, port = peer.address.rpartition("/")[2].rpartition(":")
+        for first, part in NO_TOKEN.values():
+            with (
+                suppress(ConnectionError),
+                socket.create_connection((host, int(port)), MAX_WAIT_S) as stranger,
+            ):
+                stranger.sendall(first)
+                for _ in range(500):
+                    stranger.sendall(part)
+                while stranger.recv(100):  # until the server closes the connection
+                    pass
+        assert peer.ask("wait") == {"answer": "error", "reason": "call go() first"}
 
 
 def test_a_missing_token_is_a_mistake_on_one_line() -> None:
