@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from threading import Lock
 from typing import Any, Final, cast
 
@@ -145,7 +145,7 @@ class Actions:
                 raise ConfigError(Problem(f"'{clean(str(address))}' is not a single value"))  # pyright: ignore[reportUnknownArgumentType]
         options = [f"--set={address}={value}" for address, value in changes.items()]  # pyright: ignore[reportUnknownVariableType]
         if profile := str(values.get("profile") or ""):
-            if is_path(profile):
+            if is_path(profile) or PureWindowsPath(profile).drive:
                 raise ConfigError(Problem(f"'{clean(profile)}' is a path", expected="the name of a profile"))
             options.append(f"--profile={profile}")
         command = ["queue", "add", str(path), *options]
@@ -268,7 +268,7 @@ def _mapping_fields(
     for key in dict.fromkeys((*data, *properties)):
         about, value = _resolved(properties.get(key) or {}, definitions), data.get(key)
         # a path would let visitors find out which files the computer has
-        if key in _NOT_IN_FORM or key == "scan" or about.get("format") == "path":
+        if key in _NOT_IN_FORM or key == "scan" or "path" in about.get("format", ""):
             continue
         address = f"{prefix}{key}"
         if isinstance(value, dict):

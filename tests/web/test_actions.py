@@ -148,6 +148,32 @@ def test_targets_are_drawn_and_never_named_by_a_path() -> None:
     assert "target.file" not in fields
 
 
+@pytest.mark.parametrize("kind", ["path", "file-path", "directory-path"])
+def test_no_path_of_a_plugin_is_a_value_of_the_form(kind: str) -> None:
+    """``pathlib.Path``, and what pydantic calls FilePath and DirectoryPath."""
+    schema = {"properties": {"source": {"type": "string", "format": kind}, "shots": {"type": "integer"}}}
+    fields = form_fields({"source": "mine", "shots": 1}, schema)
+    assert [field["address"] for field in fields] == ["shots"]
+
+
+@pytest.mark.parametrize("place", ["../../0001", "/etc/passwd", "0001.json", None, True, -1, 10**30])
+def test_an_entry_is_a_number_and_never_a_file(acting: Client, run_dir: Path, place: object) -> None:
+    queue = Queue(run_dir.parent.parent)
+    queue.folder.mkdir()
+    queue.write(entry(1))
+    for action in ("move", "remove", "resume"):
+        for values in ({"entry": place, "before": 1}, {"entry": 1, "before": place}):
+            if values["entry"] != 1 or action == "move":
+                assert acting.post(f"/api/v1/queue/{action}", values).status_code == 409
+    assert [each.id for each in queue.entries()] == [1]
+
+
+@pytest.mark.parametrize("run", ["%2fetc/passwd", "..%2f../etc", "2026-01-01/..%2f..%2fetc", "a%00/b"])
+def test_a_run_is_named_and_never_a_folder_elsewhere(acting: Client, run: str) -> None:
+    for action in ("stop", "notes"):
+        assert acting.post(f"/api/v1/runs/{run}/{action}", {"comment": "x"}).status_code == 404
+
+
 def test_a_known_sequence_is_queued_with_values_of_its_form(
     acting: Client, monkeypatch: pytest.MonkeyPatch, run_dir: Path
 ) -> None:
@@ -171,11 +197,17 @@ def test_a_known_sequence_is_queued_with_values_of_its_form(
     for wrong in (
         {"sequence": "../compact_225"},
         {"sequence": "none"},
+        {"sequence": str(ROOT / "sequences" / "compact_225")},
         values | {"profile": "/tmp/mine.yaml"},
+        values | {"profile": "..\\mine"},
+        values | {"profile": "C:mine"},
         values | {"changes": {"plugin_folders": "[/tmp]"}},
         values | {"changes": {"profile.camera.use": "virtual"}},
         values | {"changes": [1]},
         values | {"changes": {"target.file": "/etc/passwd"}},
+        values | {"changes": {"target": "/etc/passwd"}},
+        values | {"changes": {"target.pattern": "bitmap"}},
+        values | {"changes": {"plugin_folders.0": "/tmp"}},
         values | {"changes": {"shots": "{pattern: bitmap, file: /etc/passwd}"}},
         values | {"changes": {"shots": "&a {pattern: bitmap, file: /etc/passwd}"}},
         values | {"changes": {"shots": {"file": "/etc/passwd"}}},
