@@ -10,7 +10,8 @@ the ARTIQ master:
         "command": "python -m labseq_bridges.artiq_controller -p {port} --bind {bind}",
     },
 
-sipyco knows no passwords: whoever can connect to its port can start shots.
+sipyco knows no passwords, and evaluates calls as Python. Whoever can connect to its port can start shots and
+run programs with your rights.
 """
 
 from __future__ import annotations
