@@ -135,7 +135,8 @@ class AskedShots(BackgroundRun):
             raise ConfigError("the sequence has a scan, which run() takes; shot() takes one shot at a time")
         self._led: LedPoints | None = session.assembly.led
         self._first: Point = session.assembly.first_point
-        self._checked = {id(self._first)}  # the run checks that one before it opens the devices
+        # the run checks the first before it opens the devices; a point that is kept shares its id with no other
+        self._checked = {id(self._first): self._first}
         self._asked = queue.SimpleQueue[Point | None]()
         self._results = queue.SimpleQueue[ShotResult | None]()
         self._has_begun = False
@@ -202,7 +203,9 @@ class AskedShots(BackgroundRun):
                 check_settings(self._session, guard, point, self._session.build_lab(point))
             finally:
                 guard.end()
-            self._checked.add(id(point))
+            if len(self._checked) >= 1000:
+                self._checked.clear()
+            self._checked[id(point)] = point
         return point
 
 
