@@ -135,7 +135,7 @@ class AskedShots(BackgroundRun):
             raise ConfigError("the sequence has a scan, which run() takes; shot() takes one shot at a time")
         self._led: LedPoints | None = session.assembly.led
         self._first: Point = session.assembly.first_point
-        # the run checks the first before it opens the devices; a point that is kept shares its id with no other
+        # the run checks the first before it opens the devices; no other point has the id of a kept one
         self._checked = {id(self._first): self._first}
         self._asked = queue.SimpleQueue[Point | None]()
         self._results = queue.SimpleQueue[ShotResult | None]()
