@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, closing, suppress
@@ -110,6 +111,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add_arguments(parser)
     options = parser.parse_args(arguments)
     link = link_of(options)
+    for number in (signal.SIGINT, signal.SIGTERM):  # a program that a shell starts with & ignores Ctrl-C
+        signal.signal(number, signal.default_int_handler)
     with zmq.Context() as context, context.socket(zmq.REP) as socket, ExitStack() as stack:
         socket.maxmsgsize = LONGEST
         socket.linger = 0
