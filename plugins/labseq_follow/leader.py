@@ -22,7 +22,7 @@ from labseq.plugin.leader import GO, check_signal, load_atoms
 from labseq.plugin.messages import one_of
 from labseq_follow.answers import VERSION
 from labseq_follow.links import Event, Link, SerialLink, SimulatedLink
-from labseq_follow.protocol import About, Dialogue, Splitter, encoded
+from labseq_follow.protocol import UNANSWERED, About, Dialogue, Splitter, encoded
 from labseq_follow.settings import SIMULATED, LinkSettings, SerialLeaderSettings, TcpLeaderSettings
 from labseq_follow.tcp import TcpLink
 
@@ -178,8 +178,7 @@ class LeaderDevice(Device):
         """
         if self._dialogue.is_aborted:
             raise ShotAbortedError("the leader aborted the shot", self._name)
-        if self._dialogue.awaited == "dark":
-            self._await_reply("its imaging light may be on", self._settings.light_timeout)
+        self._await_dark()
 
     def expect_values(self, check: Callable[[Mapping[str, str]], object]) -> None:
         """Check the values of `set` by this function; see ``labseq.plugin.LeaderDialogue``."""
@@ -216,8 +215,13 @@ class LeaderDevice(Device):
         self._await_reply("its imaging light is not on", limit_s)
 
     def light_off(self, shot: int) -> None:
-        """Have it turn the light off; ``check_interlocks`` waits until it has."""
-        self._request("dark", {"shot": shot}, "dark", self._settings.light_timeout)
+        """Have it turn the light off; ``check_interlocks`` waits until it has.
+
+        Raises:
+            TransientError: None is connected.
+        """
+        if self._dialogue.awaited != UNANSWERED:  # else it left before the light was on
+            self._request("dark", {"shot": shot}, "dark", self._settings.light_timeout)
 
     def report_image(self, about: About) -> None:
         """Tell an image, if the control system wants each."""
@@ -303,20 +307,27 @@ class LeaderDevice(Device):
     def _request(self, word: str, facts: About, reply: str, longest_s: float) -> None:
         """Ask the control system for something that it replies to."""
         self._check_open()
-        if reply != self._dialogue.awaited == "dark":
-            self._await_reply("its imaging light may be on", self._settings.light_timeout)
+        if reply != "dark":
+            self._await_dark()
         with self._changed:
-            if self._link.listens and not self._dialogue.is_connected:
-                raise self._unanswered(f"no leader is connected that could answer '{word}'")
+            if self._link.listens and not self._dialogue.can_be_asked:
+                raise self._unanswered(f"the leader of this shot is not connected and cannot answer '{word}'")
             self._send(self._dialogue.request(word, facts, reply, self._link.now()))
         if simulated := self._link.arrange_reply(reply, longest_s):
             self._handle(("came", simulated))
 
+    def _await_dark(self) -> None:
+        """Wait until the imaging light is off, if labseq has asked for that."""
+        if self._dialogue.awaited in ("dark", UNANSWERED):
+            self._await_reply("its imaging light may be on", self._settings.light_timeout)
+
     def _await_reply(self, otherwise: str, timeout_s: float) -> None:
         """Wait for the reply that was asked for."""
-        if wait_for(self._replied, timeout_s, self._context.clock) is None:
-            text = f"{otherwise}: the leader has not answered within {format_quantity(timeout_s, 'time')}"
-            raise self._unanswered(text)
+        why_not = wait_for(self._replied, timeout_s, self._context.clock)
+        if why_not is None:
+            why_not = f"the leader has not answered within {format_quantity(timeout_s, 'time')}"
+        if why_not:
+            raise self._unanswered(f"{otherwise}: {why_not}")
 
     def _unanswered(self, text: str) -> TransientError:
         """The error for a leader that does not do its part: the machine has not failed, and the run goes on.
@@ -326,14 +337,15 @@ class LeaderDevice(Device):
         kind = ShotAbortedError if self._dialogue.state == "busy" else TransientError
         return kind(text, self._name)
 
-    def _replied(self, longest_s: float) -> bool | None:
+    def _replied(self, longest_s: float) -> str | None:
+        """Why the reply will not come; "" if it has come, None if it may still come."""
         with self._changed:
             if not self._dialogue.awaited:
-                return True
+                return ""
             if self._dialogue.is_aborted:
                 raise ShotAbortedError("the leader aborted the shot", self._name)
-            if self._link.listens and not self._dialogue.is_connected:
-                raise self._unanswered("the leader left before it answered")
+            if self._dialogue.awaited == UNANSWERED:
+                return "the leader left before it answered"
             self._changed.wait(longest_s)
             return None
 

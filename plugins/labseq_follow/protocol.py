@@ -32,6 +32,8 @@ NOT_ANSWERED: Final = "error"
 EXPECTED: Final = "expected go, set, abort, state? or hello"
 REPLIES: Final = ("done", "lit", "dark")
 """What a control system replies to labseq's requests."""
+UNANSWERED: Final = "unanswered"
+"""In place of a reply: the control system that owes it has left, and no other one can give it."""
 
 About = Mapping[str, Any]
 
@@ -71,7 +73,7 @@ class Dialogue:
         is_connected: Whether a control system is connected.
         asked: What the control system asked for when it connected.
         unchecked: The values of a `set` that nobody has checked yet; None if there are none.
-        awaited: The reply that labseq waits for; "" for none.
+        awaited: The reply that labseq waits for; "" for none; UNANSWERED if it will not come.
         reply: Text of the last reply.
         log: What happened.
     """
@@ -97,19 +99,26 @@ class Dialogue:
         return "waiting" if self.is_waiting else "idle"
 
     @property
+    def can_be_asked(self) -> bool:
+        """Whether the control system that began the shot is connected; any one for a shot without `go`."""
+        return self.is_connected and (self._go is None or self._go.answered != "gone")
+
+    @property
     def is_aborted(self) -> bool:
         """Whether the shot that goes on is to end."""
         return self._go is not None and self._go.is_aborted
 
     def connected(self, who: str, asked: Asked = Asked()) -> list[str]:  # noqa: B008 - frozen
         """A control system has connected."""
-        self.is_connected, self.asked, self.awaited = True, asked, ""
+        self.is_connected, self.asked = True, asked
         self.log.note(f"{who} leads")
         return [self._hello()]
 
     def lost(self, reason: str) -> None:
         """The control system is gone: a `go` for which no step waited is dropped; a shot goes on."""
         self.is_connected, self.unchecked, self._set = False, None, {}
+        if self.awaited:
+            self.awaited = UNANSWERED  # until the shot ends, even if another leader connects before
         self.log.note(f"the leader is gone: {reason}")
         if self._go is not None and not self._go.taken:
             self._go = None
@@ -159,6 +168,8 @@ class Dialogue:
         """The values for the shot that begins: those of `set`, then those of the `go` that was taken."""
         sent = {**self._set, **(self.unchecked or {})}
         self._set, self.unchecked = {}, None
+        if self.awaited == UNANSWERED:  # since the last shot
+            self.awaited = ""
         return sent if self._go is None else {**sent, **self._go.request.values}
 
     def check_set(self, reason: str) -> list[str]:

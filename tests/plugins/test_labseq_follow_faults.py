@@ -17,9 +17,9 @@ from labseq_follow.relay import can_relay
 from labseq_follow.settings import SerialLeaderSettings
 from labseq_follow.tcp import MAX_NEWCOMERS
 
-from labseq.plugin import Context, DeviceError, DeviceTimeoutError
+from labseq.plugin import Context, DeviceError, DeviceTimeoutError, TransientError
 
-from .labseq_follow_rig import PtyPeer, TcpPeer, led, listening, token_file
+from .labseq_follow_rig import MAX_WAIT_S, PtyPeer, TcpPeer, led, listening, token_file
 
 on_a_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ptys")
 
@@ -324,3 +324,21 @@ def test_a_serial_line_that_breaks_is_reported_and_the_shot_goes_on() -> None:
     assert "unplugged?" in log(device)
     device.safe_state()
     device.close()
+
+
+def test_another_leader_cannot_reply_for_one_that_left() -> None:
+    with led(light="asked") as (device, peer):
+        device.light_off(0)
+        peer.leave()
+        while device.read("is_connected"):
+            pass
+        other = TcpPeer(device.describe()["address"])
+        assert other.hear().startswith("hello")
+        assert other.ask("dark") == "error 'dark' answers nothing that labseq has asked for"
+        with pytest.raises(TransientError, match="its imaging light may be on: the leader left"):
+            device.check_interlocks()
+        assert other.ask("go") == "busy"
+        device.wait_for("go", MAX_WAIT_S)
+        device.take_values()
+        device.check_interlocks()
+        other.leave()

@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import re
 import socket
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from labseq_client import Answer, Image, LabseqError, Leader
+from labseq_virtual.camera import VirtualCamera
+from labseq_virtual.devices import VirtualLines
+from labseq_virtual.tweezers import VirtualMobileTweezers
 
 import labseq
 from labseq import ConfigError, Session
+from labseq.plugin import Hardware
 from labseq.session.check import check
 
 from .labseq_follow_rig import MAX_WAIT_S, TcpPeer, token_file
-from .test_labseq_client import leader
-from .test_labseq_follow_session import ANY_PORT, FOLLOW, GUIDE, PATIENT, Led, run_led
+from .test_labseq_client import FILE, leader
+from .test_labseq_follow_session import ANY_PORT, FOLLOW, GUIDE, PATIENT, Led, events, run_led
 
 SCAN = re.search(r"<!-- file: led_scan.yaml -->\n```yaml\n(.*?)^```$", GUIDE, re.DOTALL | re.MULTILINE)
 PROGRAM = re.search(r"^```python\n(from itertools.*?)^```$", GUIDE, re.DOTALL | re.MULTILINE)
@@ -148,6 +155,7 @@ def test_what_a_leader_cannot_set_is_reported_with_its_place(overrides: list[str
 WAIT, TURN = "{wait: {for: go, timeout: 60 s}}", "{leader: {step: science, timeout: 20 s}}"
 SCIENCE = f"shot=[{WAIT}, {{image: {{}}}}, {TURN}, {{image: {{}}}}]"
 ASKED = "profile.devices.leader.light=asked"
+REPLIES = {"your": "done", "light": "lit", "dark": "dark"}
 
 
 def test_the_leader_switches_its_light_sees_each_image_and_does_its_science(tmp_path: Path) -> None:
@@ -187,7 +195,6 @@ def test_a_shot_in_which_the_leader_does_not_reply_is_taken_again_at_its_next_go
     overrides: list[str], reason: str, tmp_path: Path
 ) -> None:
     said: list[str] = []
-    replies = {"your": "done", "light": "lit", "dark": "dark"}
 
     def lead(address: str) -> None:
         peer = TcpPeer(address, f"{token_file().read_text().strip()} version=3")
@@ -199,8 +206,8 @@ def test_a_shot_in_which_the_leader_does_not_reply_is_taken_again_at_its_next_go
             if word == "failed":
                 has_failed = True
                 peer.say("go")
-            elif has_failed and word in replies:
-                peer.say(replies[word])
+            elif has_failed and word in REPLIES:
+                peer.say(REPLIES[word])
             elif word == "ready":
                 break
         peer.leave()
@@ -210,6 +217,84 @@ def test_a_shot_in_which_the_leader_does_not_reply_is_taken_again_at_its_next_go
     assert reason in failures[0]
     assert said[-1].startswith("ready shot=0"), "the machine has not failed: labseq waits for the next go"
     assert (done.status, len(done.attempts)) == ("complete", len(failures))
+
+
+KILLED = """
+import sys
+import labseq_client
+def stay(asked):
+    print(asked, flush=True)
+    sys.stdin.read()
+with labseq_client.Leader(port=int(sys.argv[1]), timeout_s=60) as labseq:
+    labseq.go()
+    on_light = stay if sys.argv[2] == "light" else lambda exposure_s: None
+    labseq.wait(60, on_step=stay, on_light=on_light)
+"""
+
+
+def close(address: str, word: str) -> None:
+    """Begin a shot, and close the connection when labseq asks for this."""
+    peer = TcpPeer(address, f"{token_file().read_text().strip()} version=3")
+    peer.say("go")
+    while (asked := peer.hear().partition(" ")[0]) != word:
+        if asked in REPLIES:
+            peer.say(REPLIES[asked])
+    peer.leave()
+
+
+def kill(address: str, word: str) -> None:
+    """The same in a process that is killed."""
+    command = [sys.executable, "-c", KILLED, address.rpartition(":")[2], word]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, cwd=FILE.parent, stdin=pipe, stdout=pipe) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        process.kill()
+
+
+@pytest.mark.parametrize(
+    ("leave", "word", "reason"),
+    [
+        (kill, "your", "its step 'science' is not done"),
+        (kill, "light", "its imaging light is not on"),
+        (close, "dark", "its imaging light may be on"),
+    ],
+)
+def test_a_shot_whose_leader_leaves_fails_and_another_leader_begins_again(
+    leave: Callable[[str, str], None],
+    word: str,
+    reason: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Any] = []
+    made_safe: set[type[Hardware]] = set()
+    devices = {VirtualCamera, VirtualMobileTweezers, VirtualLines}
+    for device in devices:
+
+        def note(self: Any, safe_state: Callable[[Any], None] = device.safe_state) -> None:
+            made_safe.add(type(self))
+            safe_state(self)
+
+        monkeypatch.setattr(device, "safe_state", note)
+
+    def lead(address: str) -> None:
+        leave(address, word)
+        while not asked:
+            try:
+                with leader(address) as labseq:
+                    labseq.go()
+                    assert made_safe == devices, "before another shot can begin"
+                    answer = labseq.wait(MAX_WAIT_S, on_step=asked.append, on_light=asked.append)
+                    assert answer.is_ready, answer.reason
+            except LabseqError:  # labseq has not noticed yet, or makes the devices safe
+                continue
+
+    done = run_led(lead, tmp_path, SCIENCE, ASKED, "attempts=1", shots=1)
+    logged = [event["values"]["shot"]["error"] for event in events(done.path) if "repeated" in event["event"]]
+    assert logged == [f"ShotAbortedError: leader: {reason}: the leader left before it answered"]
+    assert asked == [0.045, 0.0, "science", 0.045, 0.0], "another leader answers for its own shot alone"
+    assert (done.status, len(done.shots)) == ("complete", 1)
 
 
 def test_a_dry_run_of_its_steps_and_its_light_needs_no_leader(tmp_path: Path) -> None:
