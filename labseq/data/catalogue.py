@@ -12,7 +12,7 @@ from contextlib import closing, suppress
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from labseq import __version__
 from labseq.data.entry import RunEntry
@@ -22,6 +22,9 @@ from labseq.files import cache_root, data_root
 from labseq.messages import clean
 from labseq.recording.folders import INDEX_FILE, RESULTS_FOLDER
 from labseq.recording.listing import newest_first
+
+SETTLED_S: Final = 2.0
+"""A run whose files changed within this time is not kept: another change could leave the same time."""
 
 
 def runs(
@@ -155,8 +158,7 @@ def _stamp(folder: str) -> str:
         with suppress(OSError):
             states += sorted(_changed(entry.path) for entry in os.scandir(results))
     newest = max(states)
-    # a run whose files changed within this time is not kept: another change could leave the same time
-    is_settled = newest and time.time() - newest[0] / 1e9 >= 2.0
+    is_settled = newest and time.time() - newest[0] / 1e9 >= SETTLED_S
     return f"{__version__} {states}" if is_settled else ""
 
 

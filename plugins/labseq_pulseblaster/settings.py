@@ -26,7 +26,7 @@ class PulseBlasterSettings(Settings):
     """Lines on a PulseBlaster of SpinCore."""
 
     driver: Literal["installed", "simulated"] = Field(
-        default="installed", description="`simulated`: a library with a simulated board in place of SpinAPI"
+        default="installed", description="with `simulated`, a library with a simulated board replaces SpinAPI"
     )
     model: Literal[
         "PB24-100-4k", "PB24-100-32k", "PBESR-PRO-250", "PBESR-PRO-300", "PBESR-PRO-400", "PBESR-PRO-500"

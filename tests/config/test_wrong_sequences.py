@@ -110,7 +110,7 @@ shots: 20 => shots: [[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[]]]]]]]]]]]]]]]]]]]]
 """
 KEYS = """
 shots: 20 => shoots: 20
-  5:1: 'shoots' is not a setting of a sequence; expected one of labseq, name, profile, shots, seed, target, planner, record_frames, attempts, policy, alarms, plugin_folders, scan, repeats, order, measure, regions, variables, analysis, shot; did you mean 'shots'?
+  5:1: 'shoots' is not a setting of a sequence; expected one of labseq, name, profile, shots, seed, target, planner, record_frames, attempts, policy, alarms, plugin_folders, scan, repeats, order, leader, measure, regions, variables, analysis, shot; did you mean 'shots'?
 shots: 20 => shots: 0
   5:8: shots is 0; expected at least 1
 shots: 20 => shots: "20"

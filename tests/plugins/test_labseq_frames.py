@@ -49,7 +49,7 @@ def write_run(
     }
     record |= {"sequence_text": "", "profile_text": "", "grid_spacing_m": 5e-6, "lattice": "square"}
     record |= {"resolved": {}, "overrides": {}, "devices": {}, "plugins": (), "provenance": {}}
-    record |= {"scan": {}, "steps": ()}
+    record |= {"scan": {}, "steps": (), "units": {}}
     writer = RunWriter.create(root, RunRecord(**record))
     for k, pixels in enumerate(frames_of_shots):
         frames = [Frame(one, exposure_s, 100.0 * k + i, "emccd") for i, one in enumerate(pixels)]
