@@ -195,8 +195,6 @@ GIVEN: Final[dict[str, Callable[[Path], Given]]] = {
     "docs/how-to/resume-a-run.md": _stopped,
     "docs/how-to/serial-devices.md": _serial,
     "docs/how-to/cameras-andor.md": _andor,
-    "docs/explanation/rivals.md": lambda to: Given(
-        {"n_loadings=500": "n_loadings=2", "(500, 20, 20)": "(2, 20, 20)"}
-    ),
+    "docs/explanation/rivals.md": lambda to: Given({"n_loadings=500": "n_loadings=2"}),
 }
 """Page -> prepares its folder."""
