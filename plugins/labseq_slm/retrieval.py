@@ -7,8 +7,8 @@ little with the weights and a calibration of the weights remains valid.
 
 The far field is summed over all pixels exactly at each site, as two products of matrices, instead of by a
 fast Fourier transform, whose grid of frequencies the sites are not on. Most iterations use only each fourth
-pixel of rows and columns (as Pozzi et al., Opt. Express 26, 32176, 2018, who draw them at random). This is why
-the module does not use the retrieval of ``slmsuite``: it is made for graphics cards, and its fast way rounds
+pixel of rows and columns (as Pozzi et al., Opt. Express 26, 32176, 2018, who draw them at random). The module
+does not use the retrieval of ``slmsuite``, because that is made for graphics cards and its fast method rounds
 sites to the grid of the transform.
 """
 

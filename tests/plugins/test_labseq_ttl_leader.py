@@ -151,7 +151,7 @@ def test_a_program_cannot_wait_for_the_leaders_edge(running: Firmware) -> None:
 @pytest.mark.parametrize("after_ticks", [2_000, 131_000])
 def test_an_edge_during_a_program_raises_busy_and_moves_no_edge(running: Firmware, after_ticks: int) -> None:
     pins = Pins(running)
-    line = 1 << SPECS[0].channel
+    line = 1 << int(SPECS[0].channel)
     edges = [(0, 0), *((4_000 + 7 * i, line * (i % 2)) for i in range(22))]
     running.put(0, edges)
     running.ask(f"a arm 0 {len(edges):x}")
