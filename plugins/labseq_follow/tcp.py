@@ -176,11 +176,12 @@ class TcpLink(Link):
             if (number := getattr(socket, option, None)) is not None:
                 peer.setsockopt(socket.IPPROTO_TCP, number, value)
         who = self._newcomers.pop(peer).who
-        self._leader = peer
-        if self._relay is not None and self._selector is not None:
-            self._selector.unregister(peer)
-            self._relay.serve(peer)
-            self._selector.register(self._relay.received, selectors.EVENT_READ)
+        with self._sending:  # the first that its process receives must be the socket, not an answer to expect
+            if self._relay is not None and self._selector is not None:
+                self._selector.unregister(peer)
+                self._relay.serve(peer)
+                self._selector.register(self._relay.received, selectors.EVENT_READ)
+            self._leader = peer
         return [("connected", who, asked), *([("came", rest)] if rest else [])]
 
     def _refuse(self, peer: socket.socket, why: str, answer: bytes = b"") -> list[Event]:

@@ -8,12 +8,13 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from contextlib import suppress
 from typing import Any
 
 import pytest
 from labseq_follow.leader import LeaderDevice, serial_leader
-from labseq_follow.relay import can_relay
+from labseq_follow.relay import Relay, can_relay
 from labseq_follow.settings import SerialLeaderSettings
 from labseq_follow.tcp import MAX_NEWCOMERS
 
@@ -342,3 +343,24 @@ def test_another_leader_cannot_reply_for_one_that_left() -> None:
         device.take_values()
         device.check_interlocks()
         other.leave()
+
+
+def test_a_shot_that_begins_while_a_leader_connects_does_not_disturb_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The thread of the shots tells the process beside the run what to answer; the socket comes first."""
+    device: LeaderDevice
+    serve = Relay.serve
+
+    def interrupted(self: Relay, leader: socket.socket) -> None:
+        other = threading.Thread(target=device._link.expect, args=[b"busy\n"])
+        other.start()
+        other.join(0.2)  # it ends here only if it does not wait
+        serve(self, leader)
+
+    monkeypatch.setattr(Relay, "serve", interrupted)
+    with listening() as device:
+        peer = TcpPeer(device.describe()["address"])
+        assert peer.hear().startswith("hello labseq 3")
+        assert peer.ask("go") == "busy"
+        peer.leave()
