@@ -193,6 +193,7 @@ def test_the_page_goes_on_while_a_model_hangs(tmp_path: Path, monkeypatch: pytes
         raise ZeroDivisionError("the model\nfailed")
 
     monkeypatch.setattr("labseq.data.scanned.fit_points", hang)
+    monkeypatch.setattr("labseq.web.runs.Catalogue.warm", lambda _: None)  # which fits, too
     writer = scan_of_holds(tmp_path, 4)
     client = client_of(tmp_path)
     path = f"{path_of(writer.run_dir)}/state"
