@@ -62,7 +62,7 @@ def whole_file(path: Path, *, alone: bool = False) -> Generator[IO[bytes]]:
 
 
 def _give_name(part: Path, real: Path) -> None:
-    """Rename a file that is whole; on Windows, wait until nobody reads the file that it replaces."""
+    """Rename a file that is whole; on Windows, wait until no program reads the file that it replaces."""
     attempts = 400 if os.name == "nt" else 1  # readers hold a file open for milliseconds
     for attempt in range(1, attempts + 1):
         try:

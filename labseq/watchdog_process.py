@@ -158,7 +158,8 @@ class _Process:
             if os.name == "nt":
                 import psutil
 
-                self._run_process = psutil.Process(self._run_pid)
+                with suppress(psutil.NoSuchProcess):  # it has died already; the end of the input says so
+                    self._run_process = psutil.Process(self._run_pid)
             self._answer("")
         elif "device" in order:
             try:

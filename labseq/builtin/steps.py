@@ -294,6 +294,6 @@ def wait_step(settings: WaitSettings) -> Step:
     """Waits for a time, or for the signal of an external control system."""
     if settings.signal is None or settings.timeout is None:
         return WaitStep(settings)
-    from labseq.builtin.follow import FollowStep  # most runs follow nobody
+    from labseq.builtin.follow import FollowStep  # most runs follow no other system
 
     return FollowStep(settings.signal, settings.timeout, settings.device or "")

@@ -91,7 +91,7 @@ class Control:
             frames = self._socket.recv_multipart(copy=False)
         except zmq.Again:
             return
-        client = frames[-1].get("User-Id") if self._keys.own is not None else frames[0].bytes
+        client = self._keys.client_of(frames)
         if self._faults.are_too_many(client):
             return
         with suppress(zmq.ZMQError):  # the client is gone

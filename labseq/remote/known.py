@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from labseq.messages import format_error
@@ -40,6 +40,10 @@ class KnownKeys:
     def name(self, peer: str) -> str:
         """What the client with this key is called."""
         return self._names.get(peer.encode(), "this computer")
+
+    def client_of(self, frames: Sequence[Any]) -> object:
+        """Who sent a message: the client's key, or its connection where no keys are needed."""
+        return frames[0].bytes if self.own is None else frames[-1].get("User-Id")
 
     def is_known(self, peer: str) -> bool:
         """Whether a client's key is known, or none is needed."""

@@ -197,7 +197,7 @@ class ServedDevice:
     def _handle(self, frames: list[Any]) -> None:
         import zmq
 
-        client = frames[-1].get("User-Id") if self._keys.own is not None else frames[0].bytes
+        client = self._keys.client_of(frames)
         if self._faults.are_too_many(client):
             return
         start_s = time.thread_time()

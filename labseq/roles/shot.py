@@ -386,19 +386,6 @@ class StepContext:
     lines_facts: LinesFacts = field(default_factory=lambda: LinesFacts(()))
     static_tweezers: TweezersFacts = field(default_factory=TweezersFacts)
 
-    def leave_to_leader(self, step: str, timeout_s: float, device: str = "") -> None:
-        """Let another control system do a step of its own.
-
-        Args:
-            step: Name of the step.
-            timeout_s: Longest time until it reports the end, in seconds.
-            device: Name of the device that it speaks through; "" for the only one there is.
-
-        Raises:
-            ConfigError: There is no such device.
-            DeviceError: It is not connected, leaves, or is not done in time.
-        """
-
     def margin_s(self, kind: str) -> float:
         """Extra time that a kind of step takes for the leads and lags of its lines, in seconds."""
         return margin_s(self.lines, kind)

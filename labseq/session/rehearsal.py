@@ -99,7 +99,7 @@ def rehearse(
         what = f"it fails on a random loading of {100 * loading:.0f} % (seed {seed}): {error}"
         # only the first plan is made for the loading itself
         failure = Problem(what, hint="" if cycles else f"see it with: labseq plan {drawn} --seed {seed}")
-    # number of plans whose tones are computed
+    # the tones of at most five plans are computed
     plans = [cycle.plan for shot in shots for cycle in shot if cycle.plan.n_batches][:5]
     rehearsals = [_summary(first_cycles) for first_cycles in zip(*shots, strict=True)]
     return rehearsals, plans, failure

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import ctypes.util
 import sys
+from collections.abc import Iterable
 from functools import cache
 from typing import Any
 
@@ -89,9 +90,14 @@ def hold(library: Any, flags: int) -> None:
 
     Its outputs then do not depend on what its firmware does with them after the end of a program.
     """
+    write(library, [(flags, CONTINUE, 0, HOLD_NS), (flags, BRANCH, 0, HOLD_NS)])
+    call(library, "pb_start")
+
+
+def write(library: Any, instructions: Iterable[tuple[int, int, int, float]]) -> None:
+    """Stop the board and write a program: flags, code, data and length in nanoseconds of each instruction."""
     call(library, "pb_stop")
     call(library, "pb_start_programming", 0)
-    call(library, "pb_inst_pbonly", flags, CONTINUE, 0, HOLD_NS)
-    call(library, "pb_inst_pbonly", flags, BRANCH, 0, HOLD_NS)
+    for instruction in instructions:
+        call(library, "pb_inst_pbonly", *instruction)
     call(library, "pb_stop_programming")
-    call(library, "pb_start")

@@ -20,7 +20,7 @@ from labseq.plugin import (
     format_quantity,
 )
 from labseq.plugin.lines import idle_program, off_program
-from labseq_pulseblaster.emergency import SpinapiError, call, connect, hold
+from labseq_pulseblaster.emergency import SpinapiError, call, connect, hold, write
 from labseq_pulseblaster.library import choose_library
 from labseq_pulseblaster.models import Instruction
 from labseq_pulseblaster.programs import check_outputs, flags_of, instructions_of, waiting
@@ -208,11 +208,8 @@ class PulseBlasterLines(Lines):
         if instructions == self._written:
             return
         self._written = ()
-        call(self._spinapi, "pb_stop")
-        call(self._spinapi, "pb_start_programming", 0)
-        for flags, code, data, cycles in instructions:
-            call(self._spinapi, "pb_inst_pbonly", flags, code, data, cycles * 1e9 / self._model.clock_hz)
-        call(self._spinapi, "pb_stop_programming")
+        hz = self._model.clock_hz
+        write(self._spinapi, ((flags, code, data, n * 1e9 / hz) for flags, code, data, n in instructions))
         self._written = instructions
 
     def _rest(self, program: LineProgram) -> None:
