@@ -27,10 +27,7 @@ HANDSHAKE_S: Final = 2.0
 MAX_WAITING: Final = 4
 """Messages of a connection that wait to be read: a client waits for each reply."""
 MAX_REPLIES: Final = 8
-"""Replies to a connection that wait to be sent; a ROUTER drops those above.
-
-It learns of every fourth only that it was sent, so a client that waits for each reply has five at most.
-"""
+"""Replies to a connection that wait to be sent. A client that does not read loses further ones."""
 
 _ADDRESS: Final = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]@]+):(\d{1,5})")
 
@@ -103,6 +100,10 @@ def server_socket(context: zmq.Context[Any], address: str, keys: Keys | None) ->
     socket.set(zmq.HANDSHAKE_IVL, round(1e3 * HANDSHAKE_S))
     socket.set(zmq.RCVHWM, MAX_WAITING)
     socket.set(zmq.SNDHWM, MAX_REPLIES)
+    # A ROUTER that always has a message to read seldom looks which replies were sent, and would drop a reply
+    # to a client that reads all of them. With these options it looks before it gives up.
+    socket.set(zmq.ROUTER_MANDATORY, 1)
+    socket.set(zmq.SNDTIMEO, 1)
     if keys is not None:
         socket.zap_domain = b"labseq"
         socket.curve_server, socket.curve_secretkey = True, keys.secret
