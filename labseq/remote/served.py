@@ -229,8 +229,9 @@ class ServedDevice:
         if session is None:
             raise self._refused(call.n, why_ended(self.ended, call.session))
         peer = frames[-1].get("User-Id") if session.peer else ""
-        if reason := self._why_refused(session, peer, call.n):
+        if reason := self._why_refused(session, peer, frames[0].bytes, call.n):
             raise self._refused(call.n, reason)
+        session.port_peer = frames[0].bytes
         if call.n <= session.number:  # a repetition: the method must not be called twice
             return session.reply if call.n == session.number else []
         session.begin_call(call.n, call.call)
@@ -238,10 +239,13 @@ class ServedDevice:
         session.end_call()
         return session.reply
 
-    def _why_refused(self, session: Session, peer: str, number: int) -> str:
+    def _why_refused(self, session: Session, peer: str, port_peer: bytes, number: int) -> str:
         """Why a call is not carried out; "" if it may be. Wrong calls end their session."""
         if peer != session.peer:
             return "the connection belongs to another key"
+        # frames may wait in memory for one connection only that does not read them
+        if session.port_peer not in (b"", port_peer):
+            return "its calls come from another connection"
         if not self._keys.is_known(session.peer):
             self.end_session(session, "its key was withdrawn")
         elif number > session.number + 1:

@@ -68,6 +68,7 @@ class Session:
         who: What the client calls itself, for other users.
         connection: The connection that its heartbeats come from; see :class:`labseq.wire.Connections`.
         token: Names the session in each message.
+        port_peer: ZeroMQ's name of the connection to the device's port; empty before the first call.
         beat_s: Time of its last heartbeat.
         ended: Why it has ended; "" while it has not.
         driver: Its own object of the driver; None before the client has sent its context.
@@ -83,6 +84,7 @@ class Session:
     who: str
     connection: tuple[int, int]
     token: bytes = field(default_factory=lambda: secrets.token_bytes(16))
+    port_peer: bytes = b""
     beat_s: float = field(default_factory=time.monotonic)
     ended: str = ""
     driver: ClientDriver | None = None

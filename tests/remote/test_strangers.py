@@ -92,6 +92,18 @@ def test_a_context_of_a_wrong_type_is_refused(server: Served) -> None:
             assert "context" in ask(device, message)["error"]["text"]
 
 
+def test_a_session_is_called_from_one_connection(server: Served) -> None:
+    context = served_context("laser", Context("laser", SiteGrid(6, 7), clock=FakeClock()))
+    with connected(server.port) as control, connected(server.port + 5) as device:
+        message = {"session": _begin(control, "instrument", "device"), "call": "attach", "named": {}}
+        assert "value" in ask(device, {**message, "n": 1, "args": [context]})
+        with connected(server.port + 5) as another:
+            for number in (1, 2):  # a reply that would be repeated, and a call
+                reply = ask(another, {**message, "n": number, "args": [context]})
+                assert "from another connection" in reply["error"]["text"]
+        assert "already has a driver" in ask(device, {**message, "n": 2, "args": [context]})["error"]["text"]
+
+
 def array(place: list[int], dtype: str, shape: list[int]) -> msgpack.ExtType:
     return msgpack.ExtType(1, _packed([place, dtype, shape, {}]))
 
