@@ -378,8 +378,10 @@ def _check(entry: Entry, file: Path) -> None:
         ValueError: It is not as :meth:`Queue.add` writes it.
     """
     for time in (entry.added_utc, entry.begun_utc, entry.ended_utc, entry.rules.until_utc):
-        if time and datetime.fromisoformat(time).tzinfo is None:
-            raise ValueError(f"{time}: expected a time with its zone")
+        if time and ((then := datetime.fromisoformat(time)).tzinfo is None or not 2000 <= then.year < 3000):
+            raise ValueError(f"{time}: expected a time of the years 2000 to 2999, with its zone")
+    if not 0.0 <= (entry.expected_s or 0.0) < 1e9:  # else the expected end would be no date
+        raise ValueError("expected_s: expected seconds below 1e9")
     if file.name != f"{entry.id:04d}.json":
         raise ValueError("id: expected the number in the name of the file")
     if len(entry.text) > MAX_BYTES:

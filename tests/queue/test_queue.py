@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, replace
 from fractions import Fraction
 from pathlib import Path
@@ -101,6 +102,8 @@ def test_a_new_field_of_a_later_labseq_is_no_damage(queue: Queue) -> None:
         ({"options": {"output": "../../.."}}, "output: "),
         ({"run_dir": "../x"}, "run_dir: "),
         ({"added_utc": "yesterday"}, "Invalid isoformat string: 'yesterday'"),
+        ({"begun_utc": "9999-12-31T23:59:59+00:00"}, "9999-12-31T23:59:59+00:00: expected a time of"),
+        ({"expected_s": math.inf}, "expected_s: "),
         ({"text": "x" * (1 << 19)}, "text: it is longer than 256 KiB"),
     ],
     ids=str,
