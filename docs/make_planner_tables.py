@@ -64,7 +64,6 @@ def planners(n_loadings: int) -> list[str]:
         "distance",
         "motion",
         "planning",
-        "target met",
         "to the bound",
     )
     return planner_table(header, PLANNERS, "15", n_loadings)
@@ -111,7 +110,6 @@ CELLS: Final[Mapping[str, Callable[[Row], str]]] = {
     "distance": lambda row: f"{row['distance_m'].scaled(1e3)} mm",
     "motion": _motion,
     "planning": lambda row: format_quantity(row["planning_s"]["median"], "time"),
-    "target met": lambda row: f"{100 * row['target_met'].value:.4g} %",
     "atoms lost": lambda row: str(row["n_lost"]),
     "defect-free": lambda row: f"{row['p_defect_free'].scaled(100)} %",
     "to the bound": lambda row: str(row["ratio_to_bound"]),
@@ -200,7 +198,7 @@ class Figure:
         paper: The paper's result, as text.
         paper_points: The paper's points: (x, y) each.
         histograms_at: Degrees of parallelism for which the first planner's batches are drawn as histograms.
-        options: Options of this script that give it its loading, if it is not the paper's.
+        rows: Values of x in the table; all if empty.
     """
 
     name: str
@@ -213,7 +211,7 @@ class Figure:
     paper: str
     paper_points: tuple[tuple[float, float], ...] = ()
     histograms_at: tuple[int, ...] = ()
-    options: str = ""
+    rows: tuple[int, ...] = ()
 
     @property
     def loading(self) -> float:
@@ -223,12 +221,12 @@ class Figure:
     @property
     def part(self) -> str:
         """Name of its part of the page."""
-        return f"figure {self.name}" + (f" at {percents(self.loading)}" if self.options else "")
+        return f"figure {self.name}"
 
     def at(self, loading: float) -> Figure:
         """The same at another loading."""
         conditions = tuple(replace(condition, loading=loading) for condition in self.conditions)
-        return replace(self, conditions=conditions, options=f' --loading "{percents(loading)}"')
+        return replace(self, conditions=conditions)
 
 
 def percents(loading: float) -> str:
@@ -299,6 +297,7 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
                 paper="PSCA 160.0(2) batches at 2, 29.61(3) at 15",
                 paper_points=((2, 160.0), (15, 29.61)),
                 histograms_at=(2, 3, 5, 7, 15),
+                rows=(2, 3, 5, 7, 10, 15),
             ),
             Figure(
                 name="3a",
@@ -309,6 +308,7 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
                 conditions=_INTERLEAVED,
                 fitted=True,
                 paper="PSCA 0.388(2), MTA1 0.47(1)",
+                rows=(25, 100, 225, 400),
             ),
             Figure(
                 name="3b",
@@ -319,6 +319,7 @@ FIGURES: Final[Mapping[str, Figure]] = MappingProxyType(
                 conditions=_INTERLEAVED,
                 fitted=True,
                 paper="at 400 atoms PSCA takes a quarter of MTA1's time",
+                rows=(25, 100, 225, 400),
             ),
         )
     }
@@ -459,6 +460,7 @@ def table_of(figure: Figure, report: Report) -> list[str]:
     rows = [
         [f"{x:.0f}", *(str(Estimate(c.y[i], c.error[i]).scaled(factor)) for c in curves)]
         for i, x in enumerate(curves[0].x)
+        if not figure.rows or x in figure.rows
     ]
     if figure.fitted:
         rows.append(["exponent", *(str(c.law.exponent) if c.law else "-" for c in curves)])
@@ -467,15 +469,13 @@ def table_of(figure: Figure, report: Report) -> list[str]:
 
 
 def figure_lines(figure: Figure, n_loadings: int) -> list[str]:
-    """A figure of the paper on the page: its command, its table, and at the paper's loading its picture."""
+    """A figure of the paper on the page: its command, its table and its picture."""
     report = measured(figure.planner_entries, figure.conditions, n_loadings)
-    options = f"--figure {figure.name}{figure.options} --loadings {n_loadings}"
+    options = f"--figure {figure.name} --loadings {n_loadings}"
     lines = [
         *shown(f"python docs/make_planner_tables.py {options}", not_run=True),
         *table_of(figure, report),
     ]
-    if figure.options:
-        return lines
     PICTURES.mkdir(parents=True, exist_ok=True)
     picture = PICTURES / f"figure-{figure.name}.png"
     draw_figure(picture, report, figure)
@@ -547,13 +547,12 @@ def shown(command: str, *, not_run: bool = False) -> list[str]:
     return [*note, "```console", command, "```", ""]
 
 
-FIGURE_PARTS: Final = (*FIGURES.values(), *(FIGURES[name].at(HYPOTHESIS) for name in ("2b", "2c")))
 PARTS: Final[Mapping[str, Callable[[int], list[str]]]] = MappingProxyType(
     {
         "planners": planners,
         "variants": variants,
         "sizes": sizes,
-        **{figure.part: partial(figure_lines, figure) for figure in FIGURE_PARTS},
+        **{figure.part: partial(figure_lines, figure) for figure in FIGURES.values()},
         "statements": statements,
     }
 )
