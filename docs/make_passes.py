@@ -43,8 +43,8 @@ LANES_M: Final = {
     "square": (2.245e-6, 0.0),
 }
 """Half the distance of two rows of sites, and how far the lane swings, by lattice."""
-DEPTHS_K: Final = (2.1e-3, 1.5e-3, 1.0e-3, 0.7e-3)
-TEMPERATURES_K: Final = (30e-6, 15e-6, 5e-6)
+DEPTHS_K: Final = (2.1e-3, 1.0e-3)
+TEMPERATURES_K: Final = (30e-6, 15e-6)
 
 
 def n_taken(

@@ -195,6 +195,5 @@ GIVEN: Final[dict[str, Callable[[Path], Given]]] = {
     "docs/how-to/resume-a-run.md": _stopped,
     "docs/how-to/serial-devices.md": _serial,
     "docs/how-to/cameras-andor.md": _andor,
-    "docs/explanation/rivals.md": lambda to: Given({"n_loadings=500": "n_loadings=2"}),
 }
 """Page -> prepares its folder."""
