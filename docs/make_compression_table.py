@@ -1,4 +1,4 @@
-"""Test whether an amplifier that saturates makes the step of figure 4 at 13 tweezers; write its table.
+"""Test whether an amplifier that saturates makes the step of figure 4 at 13 tweezers; print its table.
 
     python docs/make_compression_table.py
 
@@ -11,15 +11,13 @@ much from 1 to 12 tones as the fitted 3 % for each tone make.
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
+import sys
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-PAGE: Final = Path(__file__).parent / "explanation" / "virtual-lab.md"
 N_TONES: Final = 20
 RATE_HZ, STEP_HZ, CENTRE_HZ = 625e6, 1.6e6, 100e6
 N_SAMPLES: Final = 3125
@@ -66,7 +64,7 @@ def measure(level: float, n_cases: int) -> Floats:
 
 
 def main() -> None:
-    """Find the level, measure, and replace the table of the page."""
+    """Find the level, measure, and print the table."""
     low, high = 1.0, 100.0
     for _ in range(12):
         level = (low * high) ** 0.5
@@ -76,12 +74,10 @@ def main() -> None:
             high = level
     table = measure((low * high) ** 0.5, 300)
     columns = range(6, 16)
-    lines = ["", "| tones | " + " | ".join(map(str, columns)) + " |", "| --- " * 11 + "|"]
+    lines = ["| tones | " + " | ".join(map(str, columns)) + " |", "| --- " * 11 + "|"]
     for name, column in zip(("mean depth", "scatter of depths", "below the threshold"), table.T, strict=True):
         lines.append(f"| {name} (%) | " + " | ".join(f"{100 * column[n - 1]:.1f}" for n in columns) + " |")
-    text = PAGE.read_text(encoding="utf-8")
-    part = re.compile(r"(?<=<!-- measured: compression -->\n).*?(?=<!-- end -->)", re.DOTALL)
-    PAGE.write_text(part.sub("\n".join([*lines, "", ""]), text, count=1), encoding="utf-8", newline="\n")
+    sys.stdout.write("\n".join([*lines, ""]))
 
 
 if __name__ == "__main__":
