@@ -153,7 +153,8 @@ def table(n_shots: int) -> list[str]:
     head = ["| " + " | ".join(row) + " |" for row in (header, ["---"] * len(header))]
     largest = max(map(abs, deviations))
     n = len(deviations)
-    note = f"The {n} values of {len(SETTINGS)} settings deviate by {spread:.2f} standard errors (r.m.s.), by {largest:.1f} at most."
+    what = f"{n} values of {len(SETTINGS)} settings"
+    note = f"The {what} deviate by {spread:.2f} standard errors (r.m.s.), by {largest:.1f} at most."
     return [*head, *lines, "", note]
 
 
