@@ -1,1 +1,1 @@
-"""From a frame to an occupancy, or to the lattice and the light of its spots."""
+"""Turns a frame into an occupancy, or into the lattice and the light of its spots."""

@@ -1,4 +1,4 @@
-"""The common shift of all sites from their calibrated positions, measured on one frame."""
+"""Measures on one frame the common shift of all sites from their calibrated positions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 
 FURTHEST_PX: Final = 3.0
 N_STEPS: Final = 12
-"""Of the shift on one frame: its largest value along each axis, and the steps in which it is found."""
+"""Largest shift along each axis in pixels, and the number of steps in which it is found."""
 
 
 class Shift(NamedTuple):
@@ -20,7 +20,7 @@ class Shift(NamedTuple):
     Attributes:
         dy: Downwards, in pixels.
         dx: To the right.
-        error: Standard error along each axis; inf if no site is lit, and the shift is then 0.
+        error: Standard error along each axis. If no site is lit, it is inf and the shift is 0.
     """
 
     dy: float
@@ -31,10 +31,9 @@ class Shift(NamedTuple):
 def measure_shift(image: NDArray[Any], positions_px: Floats, spot_px: float) -> Shift:
     """Measure the common shift of the spots from their calibrated positions.
 
-    The light around each site is weighted by a Gaussian as wide as the spot. The
-    centre of the weights, the same for all sites, is moved until the mean moment about
-    it is 0. A uniform background does not contribute there. Dark sites, and those three
-    times as bright as the others, are left out.
+    The light around each site is weighted by a Gaussian as wide as the spot. The centre of the weights, the
+    same for all sites, is moved until the mean moment about it is 0. A uniform background does not contribute
+    there. Dark sites and sites three times as bright as the others are left out.
 
     Args:
         image: (height, width), one frame of the size that the sites belong to.
@@ -42,7 +41,7 @@ def measure_shift(image: NDArray[Any], positions_px: Floats, spot_px: float) -> 
         spot_px: Width of the spots (1 sigma).
 
     Returns:
-        The shift: accurate up to 2 pixels, 3 pixels at most.
+        The shift, 3 pixels at most and accurate up to 2 pixels.
     """
     sites = positions_px.reshape(-1, 2)
     half = int(np.ceil(FURTHEST_PX + 2.5 * spot_px))

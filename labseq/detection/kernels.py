@@ -1,4 +1,4 @@
-"""Kernels of the weighted detector: a pass over the pixels, and one over the neighbours."""
+"""Kernels of the weighted detector, for a pass over the pixels and a pass over the neighbours."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def weigh_sites(
 
     Args:
         image: uint16 (height, width), the frame.
-        corners: int64 (n_sites, 2), (y, x) of the first pixel of each region; no
-            region reaches over the edge.
+        corners: int64 (n_sites, 2), (y, x) of the first pixel of each region. No region reaches over the
+            edge.
         weights: float32 (n_sites, region, region), weight of each pixel.
         curve: float32 (65536,), value of a pixel, by its counts.
         constant: float64 (n_sites,), added to each sum.
-        odds: Result, float64 (n_sites,): the constant and the weighted sum.
+        odds: Result, float64 (n_sites,), the constant plus the weighted sum.
     """
     n_rows, n_cols = weights.shape[1], weights.shape[2]
     for site in range(len(corners)):
@@ -55,8 +55,8 @@ def undo_neighbours(starts: Ints, neighbours: Ints, effects: Floats, odds: Float
     Args:
         starts: int64 (n_sites + 1,), where each site's neighbours start in the lists.
         neighbours: int64 (n,), the sites whose light reaches it.
-        effects: float64 (n,), what an atom there adds.
-        odds: float64 (n_sites,), from :func:`weigh_sites`; more than 0 is an atom.
+        effects: float64 (n,), odds that an atom on the neighbour adds.
+        odds: float64 (n_sites,), from :func:`weigh_sites`. More than 0 is an atom.
         undone: Result, float64 (n_sites,).
     """
     for site in range(len(odds)):

@@ -32,7 +32,7 @@ Centre: TypeAlias = tuple[float, float] | None
 SATURATED: Final = 65535.0
 """Counts of a saturated pixel."""
 SCALES_PX: Final = (0.7, 1.2, 2.0, 3.3)
-"""Widths of the filters that are tried, in pixels."""
+"""Widths of the filters to try, in pixels."""
 
 
 CLEAR: Final = 4.0
@@ -45,7 +45,7 @@ class Vectors:
 
     Attributes:
         along: float64 (2,), (y, x) from a site to the next of its row, in pixels.
-        down: float64 (2,), from a site to the one below it, in the next row.
+        down: float64 (2,), from a site to the site below it, in the next row.
         width_px: Rough width of a spot (1 sigma).
     """
 
@@ -55,25 +55,25 @@ class Vectors:
 
     @property
     def shortest_px(self) -> float:
-        """The shorter of both vectors."""
+        """Length of the shorter vector."""
         return float(min(np.hypot(*self.along), np.hypot(*self.down)))
 
 
 def find_vectors(flat: Floats, grid: SiteGrid) -> Vectors | None:
     """Find the lattice's vectors in the autocorrelation of a frame.
 
-    Shifted by a vector of the lattice, the frame resembles itself, independent of
-    its offset and of dark sites. The shortest such vector within 17 degrees of
-    the image's x axis points along a row; the one nearest to the second axis of
-    ``grid`` points from row to row. A single column has no rows to start from: there the shortest vector
-    within 17 degrees of the second axis counts. A single row or column takes the other vector from ``grid``.
+    Shifted by a vector of the lattice, the frame resembles itself, independent of its offset and of dark
+    sites. The shortest such vector within 17 degrees of the image's x axis points along a row. The vector
+    nearest to the second axis of ``grid`` points from row to row. A single column has no rows, so the
+    shortest vector within 17 degrees of the second axis counts. A single row or column takes the other vector
+    from ``grid``.
 
     Args:
         flat: float64 (height, width), see :func:`labseq.detection.spots.flattened`.
         grid: Lattice and shear.
 
     Returns:
-        The vectors, or None if there are none.
+        The vectors, or None if none are found.
     """
     clearest, lags, heights, width = CLEAR, np.empty((0, 2)), np.empty(0), 0.0
     for scale in SCALES_PX:
@@ -89,7 +89,7 @@ def find_vectors(flat: Floats, grid: SiteGrid) -> Vectors | None:
     first = int(grid.n_cols == 1)  # the axis that the search begins with
     x, y = grid.axes[first]
     slant = np.arctan2(lags[:, 0] * x - lags[:, 1] * y, lags[:, 1] * x + lags[:, 0] * y)
-    likely = lags[np.abs(slant) < np.deg2rad(17)]  # a little more than the 15 degrees that users are told
+    likely = lags[np.abs(slant) < np.deg2rad(17)]  # a little more than the documented 15 degrees
     if len(likely) == 0:
         return None
     shortest = likely[np.argmin(np.hypot(*likely.T))]
@@ -103,7 +103,7 @@ def find_vectors(flat: Floats, grid: SiteGrid) -> Vectors | None:
 
 
 def autocorrelation(flat: Floats) -> Floats:
-    """Autocorrelation for lags up to 55 pixels, float64 (2 m + 1, 2 m + 1), 1 without a lag."""
+    """Autocorrelation for lags up to 55 pixels, float64 (2 m + 1, 2 m + 1), 1 at zero lag."""
     from scipy.fft import irfft2, next_fast_len, rfft2
 
     reach = int(min(55.0, *(n - 1 for n in flat.shape)))
@@ -174,14 +174,14 @@ def fit_surface(
     are at least three points for each term.
 
     Args:
-        indices: (n, 2), row and column of each point. What does not differ in them is not fitted: along a
-            single row, places depend on the column only.
+        indices: (n, 2), row and column of each point. A coordinate with one value is not fitted, so along a
+            single row places depend on the column only.
         places: float64 (n, 2), (y, x) of each.
         degree: Highest degree of a term.
-        trust: float64 (n,), weight of each point; None is 1.
+        trust: float64 (n,), weight of each point. None means 1.
 
     Returns:
-        The surface, and the final weights of the points, float64 (n,): 0 for outliers.
+        The surface, and the final weights of the points, float64 (n,), 0 for outliers.
     """
     centre = (indices.max(axis=0) + indices.min(axis=0)) / 2
     scale = max(1.0, float(np.abs(indices - centre).max()))
@@ -231,7 +231,7 @@ BRIGHT: Final = 0.5
 """Minimum light of a spot from which the lattice is found, relative to the usual light."""
 
 LINE_LIT: Final = 0.25
-"""Minimum fraction of bright sites in a row or column of the array, of all or of those in the fullest."""
+"""Minimum fraction of bright sites in a row or column, of all its sites or of the count in the fullest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,7 +241,7 @@ class Indexed:
     Attributes:
         spots: int64 (n,), indices of the spots.
         indices: int64 (n, 2), row and column of each.
-        surface: The places of all rows and columns.
+        surface: Places of all rows and columns.
     """
 
     spots: Ints
@@ -254,13 +254,12 @@ def index_spots(
 ) -> Indexed | None:
     """Assign a row and a column to each spot.
 
-    It starts at a bright spot with neighbours at the expected places, and continues
-    outwards a few sites at a time. The places are fitted again after each step, so
-    that distortions do not add up. A single row or column is followed along itself only; if its centre is
-    known, from the spot nearest to it.
+    It starts at a bright spot with neighbours at the expected places, and continues outwards a few sites at a
+    time. The places are fitted again after each step, so that distortions do not add up. A single row or
+    column is followed along itself only, starting at the spot nearest to its centre if the centre is known.
 
     Returns:
-        None if too few spots are neighbours: three, or both of a line of two.
+        None if too few spots are neighbours (three, or both of a line of two).
     """
     from scipy.spatial import KDTree
 
@@ -297,7 +296,7 @@ def index_spots(
 
 
 def _in_full_lines(square: Ints, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether each spot is in a row and a column with many spots; noise outside of the array is not."""
+    """True for each spot in a row and a column with many spots, which excludes noise outside the array."""
     full = np.ones(len(square), np.bool_)
     for values in square.T:
         _, line = np.unique(values, return_inverse=True)
@@ -309,9 +308,9 @@ def _in_full_lines(square: Ints, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def find_window(
     spots: Spots, indexed: Indexed, shape: tuple[int, int], centre_px: Centre = None
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Choose the rows and columns of the array, ``shape`` of the grid: those with the most light.
+    """Choose the ``shape`` rows and columns with the most light.
 
-    With its centre given, those that are nearest to it count, whatever else is lit.
+    If the centre is given, choose the nearest rows and columns, whatever else is lit.
 
     Returns:
         Row and column of site (0, 0), and the number of bright rows and columns of the array.
@@ -364,19 +363,19 @@ MIN_FOUND: Final = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundLattice:
-    """The positions of the sites on the frame; nan for what a single line or site does not show.
+    """Positions of the sites on the frame. A value that a single line or site does not show is nan.
 
     Attributes:
-        positions_px: float64 (n_rows, n_cols, 2), (y, x) of each site: a smooth lattice
-            fitted to all spots, so that dark sites have a position, too.
-        residuals_px: float64 (n_rows, n_cols, 2), (y, x) of each spot minus its site; NaN for dark sites.
+        positions_px: float64 (n_rows, n_cols, 2), (y, x) of each site on a smooth lattice fitted to all
+            spots, so that dark sites also have a position.
+        residuals_px: float64 (n_rows, n_cols, 2), (y, x) of each spot minus its site, or NaN for dark sites.
         light: float64 (n_rows, n_cols), total counts of each spot.
         frame: (height, width) of the frame.
         spot_px: Width of the spots (1 sigma).
-        spacing_px: From a site to the next of its row, and to the one below it, in the middle of the array.
+        spacing_px: From a site to the next of its row, and to the site below it, in the middle of the array.
         angle_rad: Rotation of the grid, clockwise on the screen, without stretch and shear.
-        stretch: Largest magnification of any direction over the smallest.
-        pixel_size_m: Size of a pixel in the atom plane, if the grid's spacing is true.
+        stretch: Ratio of the largest magnification of any direction to the smallest.
+        pixel_size_m: Size of a pixel in the atom plane, if the grid's spacing is right.
         residual_px: R.m.s. distance of the spots from the lattice.
     """
 
@@ -405,23 +404,22 @@ class FoundLattice:
 def find_lattice(image: NDArray[Any], grid: SiteGrid, *, centre_px: Centre = None) -> FoundLattice:
     """Find the positions of a grid's sites on an averaged frame.
 
-    Rows run along the image's x axis within 15 degrees, from left to right;
-    ``grid.shear`` says which of the other directions is the second axis, and it
-    leads downwards. So row 0 is at the top and column 0 at the left, and the
-    six-fold symmetry of the triangular lattice causes no ambiguity. All sites must be
-    on the frame; spacings of 5 to 40 pixels, spots of 0.5 to 4 pixels (1 sigma) with at
-    least 2.5 of their widths between them. A single column is within 15 degrees of the grid's second axis.
+    Rows run along the image's x axis within 15 degrees, from left to right. ``grid.shear`` says which of the
+    other directions is the second axis, which leads downwards. So row 0 is at the top and column 0 at the
+    left, and the six-fold symmetry of the triangular lattice causes no ambiguity. All sites must be on the
+    frame. The spacing must be 5 to 40 pixels and the spots 0.5 to 4 pixels wide (1 sigma), with at least 2.5
+    widths between them. A single column is within 15 degrees of the grid's second axis.
 
     The steps are described in ``docs/explanation/finding-sites.md``.
 
     Args:
         image: (height, width), mean of frames on which each site often holds an atom.
-        grid: The grid of sites: its size, lattice and shear; its spacing is not used.
-        centre_px: (y, x) of the middle of the grid, to less than half a spacing, for frames that
-            show more of the lattice, or more lines or spots, than the grid has.
+        grid: Size, lattice and shear of the grid of sites. Its spacing is not used.
+        centre_px: (y, x) of the middle of the grid to better than half a spacing, for frames that show more
+            of the lattice, or more lines or spots, than the grid has.
 
     Raises:
-        DeviceError: No such lattice is on the frame; says why.
+        DeviceError: No such lattice is on the frame. The message says why.
     """
     counts = _checked(image, grid)
     flat = flattened(counts, grid.n_rows * grid.n_cols)
@@ -450,7 +448,7 @@ def _checked(image: NDArray[Any], grid: SiteGrid) -> Floats:
     counts = np.asarray(image, np.float64)
     if counts.ndim != 2 or min(counts.shape) < 16 or not np.isfinite(counts).all():
         _fail(
-            f"the frame is {image.dtype} {image.shape}; expected finite numbers, (height, width) of 16 "
+            f"the frame is {image.dtype} {image.shape}; expected finite numbers, (height, width) at least 16 "
             "pixels or more",
         )
     highest = counts.max()
@@ -468,7 +466,7 @@ def _fail(message: str) -> NoReturn:
 
 
 def _single(flat: Floats, noise: float, centre_px: Centre) -> tuple[Vectors, Surface]:
-    """The place of the only spot, or of that nearest to ``centre_px``; the vectors are made up."""
+    """The place of the only spot, or of the spot nearest to ``centre_px``, with made-up vectors."""
     width = max(SCALES_PX, key=lambda scale: scale * float(filtered_by_width(flat, scale).max()))
     spacing = 8 * width
     spots = find_spots(flat, spacing, width, 2 * noise)
@@ -490,20 +488,20 @@ def _indexed(
     n_indexed = 0 if indexed is None else len(indexed.spots)
     if indexed is None or n_indexed < MIN_FOUND * min(bright, n_sites):
         _fail(
-            f"of {bright} spots only {n_indexed} are on a lattice; {n_sites} are expected; {_DARK}",
+            f"of {bright} spots only {n_indexed} are on a lattice, but {n_sites} are expected; {_DARK}",
         )
     n_others = bright - n_indexed
     if 1 in grid.shape and centre_px is None and n_others > 0.25 * n_sites:
         _fail(
-            f"the grid has {grid.n_rows} x {grid.n_cols} sites, and {n_others} spots are beside its line; "
+            f"the grid has {grid.n_rows} x {grid.n_cols} sites, but {n_others} spots are off its line; "
             f"{_MORE}"
         )
     first, lit_shape = find_window(spots, indexed, grid.shape, centre_px)
     if lit_shape != grid.shape:
         rows, cols = lit_shape
         _fail(
-            f"{rows} x {cols} rows and columns of sites are lit, the grid has {grid.n_rows} x {grid.n_cols}; "
-            "a dark row or column at the edge is ambiguous: load it, or set the "
+            f"{rows} x {cols} rows and columns are lit, but the grid has {grid.n_rows} x {grid.n_cols}; "
+            "load a dark row or column at the edge, which is ambiguous, or set the "
             f"size and `shear` of `grid` to those of the static tweezers; {_MORE}",
         )
     return indexed.surface, first
@@ -533,11 +531,11 @@ def _refined(
     if residual > 0.08 * shortest:
         _fail(
             f"the spots are {residual:.2f} pixels (r.m.s.) away from a lattice of {shortest:.1f} pixels; "
-            "sites of an irregular array come from a file: set `detector.sites`",
+            "for an irregular array, read the sites from a file with `detector.sites`",
         )
     height, width = flat.shape
     if ((positions < -0.5) | (positions > np.array([height, width]) - 0.5)).any():
-        _fail("some of its sites are outside of the frame; move the camera or take a larger frame")
+        _fail("some of its sites are outside the frame; move the camera or take a larger frame")
     return _described(positions, residuals, fitted, residual, surface, index, flat.shape, grid)
 
 

@@ -24,17 +24,17 @@ Floats = NDArray[np.float64]
 
 PositiveLength = Annotated[Length, Field(gt=0)]
 Thresholds: TypeAlias = float | FilePath | tuple[tuple[float, ...], ...]
-"""One number for all sites, one for each, or the path of a .npy file with one for each."""
+"""One number for all sites, a number for each, or the path of a .npy file with a number for each."""
 
 COLUMNS: Final = ("row", "col", "y", "x")
 
 UNREADABLE: Final = (OSError, ValueError, TypeError, MemoryError, OverflowError)
-"""What :func:`read_npy` raises for a file that it cannot read."""
+"""Exceptions of :func:`read_npy` for a file that it cannot read."""
 _MAX_BYTES: Final = 1 << 26
 
 
 class SiteSettings(Settings):
-    """Where the sites are on the frames.
+    """Positions of the sites on the frames.
 
     The file in `sites` takes precedence over the calibration of sites in use, and that
     over the geometry set here.
@@ -42,8 +42,8 @@ class SiteSettings(Settings):
 
     sites: FilePath | None = Field(
         default=None,
-        description="file with the place of each site, for an irregular array: .npy of (y, x), shape "
-        "[rows, cols, 2], or .csv with the columns row, col, y, x; in pixels",
+        description="file with the place of each site in pixels, for an irregular array; .npy of (y, x), "
+        "shape [rows, cols, 2], or .csv with the columns row, col, y, x",
     )
     frame: tuple[PositiveInt, PositiveInt] = Field(
         default=(512, 512),
@@ -51,21 +51,21 @@ class SiteSettings(Settings):
     )
     centre_px: tuple[float, float] = Field(
         default=(255.5, 255.5),
-        description="[y, x] of the grid's centre in pixels; whole numbers are the middles of pixels",
+        description="[y, x] of the grid's centre in pixels, where whole numbers are centres of pixels",
     )
     pixel_size: PositiveLength = Field(
         default=0.35e-6, description="size of a camera pixel in the atom plane"
     )
     angle: Angle = Field(default=0.0, description="rotation of the grid on the frame, clockwise")
     region: PositiveInt = Field(
-        default=5, description="width of the region of interest around each site, in pixels; odd"
+        default=5, description="width of the region of interest around each site, an odd number of pixels"
     )
 
     @field_validator("region")
     @classmethod
     def _region_is_odd(cls, region: int) -> int:
         if region % 2 == 0:
-            raise ValueError(f"{region} is even; a region has a pixel in its middle: choose {region + 1}")
+            raise ValueError(f"{region} is even; choose an odd width, for example {region + 1}")
         return region
 
 
@@ -75,12 +75,12 @@ def site_pixels(
     """Map the sites onto the camera.
 
     Args:
-        grid: The grid of sites; its centre is the origin of its positions.
+        grid: The grid of sites. Its centre is the origin of its positions.
         pixel_size_m: Size of a camera pixel in the atom plane, in metres.
-        centre_px: (y, x) of the grid's centre. Whole numbers are the middles of
-            pixels, so the centre of a 512 x 512 frame is (255.5, 255.5).
-        angle_rad: Rotation of the grid about its centre; positive is clockwise on
-            the screen, where y points down.
+        centre_px: (y, x) of the grid's centre. Whole numbers are the centres of pixels, so the centre of a
+            512 x 512 frame is (255.5, 255.5).
+        angle_rad: Rotation of the grid about its centre. Positive is clockwise on the screen, where y points
+            down.
 
     Returns:
         float64 (n_rows, n_cols, 2), (y, x) of each site in pixels.
@@ -99,13 +99,13 @@ def site_pixels(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownSites:
-    """Where the sites are.
+    """Positions of the sites.
 
     Attributes:
-        positions_px: float64 (n_rows, n_cols, 2), (y, x) of each site in pixels; read-only.
+        positions_px: float64 (n_rows, n_cols, 2), (y, x) of each site in pixels. Read-only.
         frame: (height, width) of the frames that they belong to.
-        source: Where they come from, for messages: "the calibration of sites a1b2c3d4e5f6".
-        remedy: What to do if they do not match the frames.
+        source: Their source, for messages, such as "the calibration of sites a1b2c3d4e5f6".
+        remedy: What to do if they do not match the frames, for messages.
     """
 
     positions_px: Floats
@@ -129,7 +129,7 @@ def known_sites(settings: SiteSettings, context: Context) -> KnownSites:
             read_sites(settings.sites, context.grid.shape),
             settings.frame,
             f"the sites in {settings.sites}",
-            "check the file, and `frame` of the detector",
+            "check the file and the detector's `frame`",
         )
     entry = context.calibrations.get("sites")
     if entry is not None:
@@ -138,13 +138,13 @@ def known_sites(settings: SiteSettings, context: Context) -> KnownSites:
             entry.values["positions_px"],
             (height, width),
             f"the calibration of sites {entry.id}",
-            "calibrate the sites with this camera, crop it as it was then, or take another calibration",
+            "calibrate the sites with this camera, crop it as it was then, or use another calibration",
         )
     return KnownSites(
         site_pixels(context.grid, settings.pixel_size, settings.centre_px, settings.angle),
         settings.frame,
         "the detector's settings",
-        "calibrate the sites, or check `centre_px`, `pixel_size`, `angle` and `frame` of the detector",
+        "calibrate the sites, or check the detector's `centre_px`, `pixel_size`, `angle` and `frame`",
     )
 
 
@@ -161,7 +161,7 @@ def read_sites(path: Path, shape: tuple[int, int]) -> Floats:
         float64 (n_rows, n_cols, 2).
 
     Raises:
-        ConfigError: It cannot be read, or does not have one position for each site.
+        ConfigError: The file cannot be read, or does not have one position for each site.
     """
     try:
         positions = read_npy(path) if path.suffix == ".npy" else _table(path, shape)
@@ -174,14 +174,14 @@ def read_sites(path: Path, shape: tuple[int, int]) -> Floats:
     if positions.shape != (*shape, 2) or not np.isfinite(positions).all():
         came = f"of shape {positions.shape}" if positions.shape != (*shape, 2) else "not all finite"
         raise ConfigError(
-            f"the sites in '{path}' are {came}; expected (y, x) for each of {shape[0]} x {shape[1]} sites: "
-            f"{(*shape, 2)}"
+            f"the sites in '{path}' are {came}; expected (y, x) for each of {shape[0]} x {shape[1]} sites, "
+            f"shape {(*shape, 2)}"
         )
     return positions
 
 
 def read_npy(path: Path) -> Floats:
-    """Read the numbers of a .npy file; raises one of :data:`UNREADABLE`."""
+    """Read the numbers of a .npy file, or raise one of :data:`UNREADABLE`."""
     return np.lib.format.read_array(io.BytesIO(_data_in(path)), allow_pickle=False).astype(np.float64)
 
 
@@ -208,16 +208,14 @@ def _table(path: Path, shape: tuple[int, int]) -> Floats:
                 raise ValueError(f"line {table.line_num} does not have four numbers") from None
             if not (0 <= row < shape[0] and 0 <= col < shape[1]):
                 raise ValueError(
-                    f"line {table.line_num} is of site ({row}, {col}), which the grid does not have"
+                    f"line {table.line_num} has site ({row}, {col}), which the grid does not have"
                 )
             if not np.isnan(positions[row, col, 0]):
-                raise ValueError(f"line {table.line_num} is of site ({row}, {col}), like an earlier line")
+                raise ValueError(f"line {table.line_num} has site ({row}, {col}), like an earlier line")
             positions[row, col] = place
     unplaced = np.argwhere(np.isnan(positions[..., 0]))
     if len(unplaced):
-        raise ValueError(
-            f"{len(unplaced)} sites are missing, ({unplaced[0, 0]}, {unplaced[0, 1]}) among them"
-        )
+        raise ValueError(f"{len(unplaced)} sites are missing, such as ({unplaced[0, 0]}, {unplaced[0, 1]})")
     return positions
 
 
@@ -227,7 +225,7 @@ def region_corners(known: KnownSites, region: int) -> NDArray[np.int64]:
     The square is centred on the pixel nearest to the site.
 
     Args:
-        known: Where the sites are.
+        known: Positions of the sites.
         region: Width of the squares, odd.
 
     Raises:
@@ -245,23 +243,23 @@ def region_corners(known: KnownSites, region: int) -> NDArray[np.int64]:
             f"the region of interest of site ({row}, {col}), according to {known.source},",
             f"rows {y} to {y + last} and columns {x} to {x + last} of the frame",
             f"a frame of {height} x {width} pixels",
-            f"{known.remedy}; or take a smaller `region`",
+            f"{known.remedy}, or use a smaller `region`",
         )
     return corners
 
 
 def checked_image(frame: Frame, known: KnownSites, name: str) -> NDArray[np.uint16]:
-    """The image of a frame of the size that the sites belong to.
+    """The image of a frame, if it has the size that the sites belong to.
 
     Raises:
-        DeviceError: It is of another size or dtype; ``name`` is the detector's.
+        DeviceError: It has another size or dtype. ``name`` is the detector's.
     """
     image = frame.image
     if image.shape != known.frame or image.dtype != np.uint16:
         height, width = known.frame
         raise DeviceError(
             name,
-            f"the frame is {image.dtype} {image.shape}; according to {known.source}, the sites are on "
+            f"the frame is {image.dtype} {image.shape}, but according to {known.source} the sites are on "
             f"uint16 frames of ({height}, {width}); {known.remedy}",
         )
     return image

@@ -1,4 +1,4 @@
-"""Spots on an averaged frame: hot pixels and stray light removed, spots found and fitted."""
+"""Finds and fits the spots on an averaged frame, after removing hot pixels and stray light."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 HOT: Final = 6.0
-"""A pixel this many times brighter than its second brightest neighbour is hot; spots of 0.45 px are not."""
+"""A pixel this many times brighter than its second brightest neighbour is hot. Spots of 0.45 px are not."""
 
 
 def spot_light(
@@ -44,10 +44,9 @@ def spot_light(
 def flattened(image: NDArray[Any], n_sites: int) -> Floats:
     """Remove hot pixels and stray light from a frame.
 
-    Stray light is the 30 % quantile of tiles 48 pixels wide, smoothly interpolated:
-    the dark pixels between the spots, or a constant below the mean
-    where spots fill the tile. Pixels are clipped at twice the brightness of the
-    brightest pixels of spots.
+    Stray light is the 30 % quantile of tiles 48 pixels wide, smoothly interpolated. This is the level of the
+    dark pixels between the spots, or a constant below the mean where spots fill the tile. Pixels are clipped
+    at twice the brightness of the brightest pixels of spots.
 
     Args:
         image: (height, width), of any real dtype.
@@ -67,7 +66,7 @@ def without_hot_pixels(image: NDArray[Any]) -> Floats:
     """Replace single bright pixels, and pairs, by the median of their neighbours."""
     counts = np.array(image, np.float64)
     dark, noise = np.median(counts), pixel_noise(counts)
-    places = np.nonzero(counts - dark > 2 * HOT * noise)  # the others are too dim, whatever is beside them
+    places = np.nonzero(counts - dark > 2 * HOT * noise)  # the others are too dim, whatever their neighbours
     edged = np.pad(counts, 1, mode="reflect")
     around = np.sort([edged[places[0] + i // 3, places[1] + i % 3] for i in (0, 1, 2, 3, 5, 6, 7, 8)], axis=0)
     second = np.maximum(around[-2] - dark, noise)
@@ -119,13 +118,13 @@ class Spots:
 
 
 def find_spots(flat: Floats, spacing_px: float, width_px: float, noise: float) -> Spots:
-    """Find the maxima after a Gaussian filter as wide as the spots, minus one twice as wide.
+    """Find the maxima after a Gaussian filter as wide as the spots, minus a filter twice as wide.
 
     Args:
         flat: float64 (height, width), see :func:`flattened`.
         spacing_px: Shortest distance of two spots.
         width_px: Width of the spots (1 sigma), roughly.
-        noise: Noise of a pixel (1 sigma); spots are three times brighter than it after the filter.
+        noise: Noise of a pixel (1 sigma). Spots are three times brighter after the filter.
     """
     from scipy.ndimage import maximum_filter
 
@@ -166,7 +165,7 @@ REACH: Final = 2.7
 """Distance from a spot to the last pixel that is fitted, in widths of the spot."""
 
 KNOT_PX: Final = 64
-"""Distance of the knots of stray light, in pixels; it changes linearly between them."""
+"""Distance of the knots of stray light, in pixels, between which it changes linearly."""
 
 
 DIM: Final = 0.25
@@ -180,7 +179,7 @@ class FittedSpots:
     Attributes:
         places: float64 (n, 2), (y, x) of each, in pixels.
         light: float64 (n,), total counts of each.
-        width_px: Width of all (1 sigma).
+        width_px: Common width (1 sigma).
     """
 
     places: Floats
@@ -191,10 +190,9 @@ class FittedSpots:
 def fit_spots(flat: Floats, places: Floats, width_px: float, furthest_px: float, noise: float) -> FittedSpots:
     """Fit places, light and the common width of spots, and stray light, by the Gauss-Newton method.
 
-    All are fitted together, so that spots may overlap, and a spot at the edge of the
-    array is not pulled towards its neighbours. The variance of a pixel is that of a
-    dark pixel plus a part proportional to its light; the factor comes from the
-    residuals of the previous pass.
+    All are fitted together, so that spots may overlap, and a spot at the edge of the array is not pulled
+    towards its neighbours. The variance of a pixel is the variance of a dark pixel plus a part proportional
+    to its light, with a factor from the residuals of the previous pass.
 
     Args:
         flat: float64 (height, width).
@@ -224,8 +222,8 @@ def fit_spots(flat: Floats, places: Floats, width_px: float, furthest_px: float,
         width_px = float(np.clip(width_px + wider, 0.35, 8.0))
         settled = light.any() and max(abs(wider), np.median(np.abs(places - before))) < 0.01 * width_px
         light = np.where(all_light > DIM * usual, all_light, 0.0)
-        # how well the shape of spots is known, relative to their peak; bright ones are not fitted by their
-        # wings
+        # how well the shape of spots is known, relative to their peak, so that the wings of bright spots do #
+        # not dominate
         dark_noise = max(noise, 0.01 * usual / (2 * np.pi * width_px**2))
         glow.ravel()[pixels] = spots[:, :n] @ light
         residuals = counts - matrix @ solution
@@ -241,7 +239,7 @@ class KnownSpots:
     Args:
         shape: (height, width) of the frames.
         places: float64 (n, 2), (y, x) of each spot, in pixels.
-        width_px: Width of all (1 sigma).
+        width_px: Common width (1 sigma).
     """
 
     def __init__(self, shape: tuple[int, int], places: Floats, width_px: float) -> None:
@@ -267,7 +265,7 @@ def _spot_columns(
     """Derivatives of the pixels around the spots by light, y and x of each spot, and by the common width.
 
     Returns:
-        The pixels, as flat indices; a sparse matrix (n_pixels, 3 n); the column of the width.
+        The pixels, as flat indices, a sparse matrix (n_pixels, 3 n), and the column of the width.
     """
     from scipy.sparse import csr_array
 

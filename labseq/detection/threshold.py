@@ -1,4 +1,4 @@
-"""The threshold detector, and the base of detectors that compare a signal with a threshold."""
+"""The threshold detector, and the base class of detectors that compare a signal with a threshold."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from labseq.roles import Context
 
 
 class ComparingDetector(ABC):
-    """Base of detectors: there is an atom where the signal exceeds the site's threshold.
+    """Base of detectors that report an atom where the signal exceeds the site's threshold.
 
-    The sites come from the file in ``sites``, else from the calibration of sites in
-    use, else from the geometry in the settings; the thresholds from the calibration of
-    thresholds in use, else from the settings.
+    The sites come from the file in ``sites``, else from the calibration of sites in use, else from the
+    geometry in the settings. The thresholds come from the calibration of thresholds in use, else from the
+    settings.
 
     Args:
-        settings: Where the sites are.
+        settings: Positions of the sites.
         threshold: Threshold of each site, unless a calibration of thresholds is in use.
         width: Distance from the threshold at which the confidence is tanh(1) = 0.76.
         context: Grid, calibrations and name.
@@ -41,7 +41,7 @@ class ComparingDetector(ABC):
     Raises:
         LimitError: A region extends over the edge of the frame, or the thresholds do
             not have one value per site.
-        ConfigError: A file cannot be read, or the calibrated thresholds are of another unit.
+        ConfigError: A file cannot be read, or the calibrated thresholds have another unit.
     """
 
     signal_unit: ClassVar[str]
@@ -66,8 +66,8 @@ class ComparingDetector(ABC):
         """Find the atoms.
 
         Returns:
-            The occupancy, bool (n_rows, n_cols); the confidence per site, float32 (n_rows, n_cols), 0 at
-            the threshold and 1 for certainty; and the signals that were compared with the thresholds.
+            The occupancy, bool (n_rows, n_cols), the confidence per site, float32 (n_rows, n_cols), 0 at the
+            threshold and 1 for certainty, and the signals that were compared with the thresholds.
 
         Raises:
             DeviceError: The frame is not of the size that the sites belong to.
@@ -89,7 +89,7 @@ def known_thresholds(threshold: Thresholds, unit: str, context: Context) -> tupl
         float64 (n_rows, n_cols), in the detector's unit, and where they come from, for messages.
 
     Raises:
-        LimitError: Not one finite value per site.
+        LimitError: A site does not have exactly one finite value.
         ConfigError: The file cannot be read, or the calibration's ``origin`` names another unit.
     """
     entry = context.calibrations.get("thresholds")
@@ -100,7 +100,7 @@ def known_thresholds(threshold: Thresholds, unit: str, context: Context) -> tupl
     if theirs != unit:
         raise ConfigError(
             f"the calibration of thresholds {entry.id} is in {theirs}, but the detector compares {unit}; "
-            "calibrate the thresholds with this detector, or take another calibration, or `off`"
+            "calibrate the thresholds with this detector, or use another calibration or `off`"
         )
     return entry.values["thresholds"], f"the calibration of thresholds {entry.id}"
 
@@ -109,7 +109,7 @@ def site_thresholds(threshold: Thresholds, shape: tuple[int, int]) -> NDArray[np
     """One threshold per site, float64 (n_rows, n_cols).
 
     Raises:
-        LimitError: Not one finite value per site.
+        LimitError: A site does not have exactly one finite value.
         ConfigError: The file cannot be read.
     """
     if isinstance(threshold, str | Path):
@@ -145,8 +145,7 @@ def _load(path: Path) -> NDArray[np.float64]:
 class ThresholdSettings(SiteSettings):
     """A region of interest and a threshold per site.
 
-    The defaults fit the virtual lab: they give the paper's mean detection
-    fidelity of 99.946 % on its frames.
+    With the defaults, the virtual lab's frames give the paper's mean detection fidelity of 99.946 %.
     """
 
     shape: Literal["square", "disc"] = Field(default="square", description="shape of the region of interest")
@@ -154,8 +153,8 @@ class ThresholdSettings(SiteSettings):
     threshold: Thresholds = Field(
         default=1630.0,
         description="counts over the offset, summed over the region, above which there is an atom, "
-        "unless a calibration of thresholds is in use: one number, one for each site (rows of numbers), or "
-        "the path of a .npy file with one for each site",
+        "unless a calibration of thresholds is in use; one number, rows of numbers (one per site), or "
+        "the path of a .npy file with one per site",
     )
     width: PositiveFloat = Field(
         default=130.0,
@@ -166,14 +165,12 @@ class ThresholdSettings(SiteSettings):
 class ThresholdDetector(ComparingDetector):
     """Sums a region of interest around each site and compares with a threshold.
 
-    There is an atom on site (i, j) if the counts of its region, less the offset
-    of each pixel, exceed T_ij (paper, "Experimental Setup"). The confidence is
-    ``tanh(|counts - T_ij| / width)``: for two classes whose log-odds grow linearly
-    with the counts, that is the probability of being right, scaled to 0..1.
+    There is an atom on site (i, j) if the counts of its region, less the offset of each pixel, exceed T_ij
+    (paper, "Experimental Setup"). The confidence is ``tanh(|counts - T_ij| / width)``. For two classes whose
+    log-odds grow linearly with the counts, it is the probability of being right, scaled to 0..1.
 
     Args:
-        settings: A threshold given as text is the path
-            of a .npy file of floats (n_rows, n_cols), read here.
+        settings: A threshold given as text is the path of a .npy file of floats (n_rows, n_cols).
         context: Grid, calibrations and name.
 
     Raises:
@@ -210,7 +207,7 @@ class ThresholdDetector(ComparingDetector):
 
 
 class BlindDetector:
-    """Accepts any frame and detects no atoms; for runs that calibrate the sites.
+    """Accepts any frame and detects no atoms, for runs that calibrate the sites.
 
     Args:
         settings: None.

@@ -1,4 +1,4 @@
-"""The weighted detector: the log-odds of an atom, with the light of its neighbours corrected."""
+"""The weighted detector, which uses log-odds of an atom, corrected for the light of its neighbours."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ Floats = NDArray[np.float64]
 class WeightedSettings(SiteSettings):
     """The likelihood of an atom from spot-shaped weights, corrected for the neighbours' light.
 
-    Fewer errors than with `threshold`, for more to be known of the camera. The
-    defaults fit the virtual lab.
+    It makes fewer errors than `threshold`, but needs more properties of the camera. The defaults fit the
+    virtual lab.
     """
 
     region: PositiveInt = Field(
         default=9,
-        description="width of the square of pixels that is weighed around each site; odd, and at least "
+        description="width of the square of pixels that is weighed around each site, an odd number, at least "
         "six times the width of the spot",
     )
     spot: PositiveLength = Field(
@@ -45,19 +45,20 @@ class WeightedSettings(SiteSettings):
     )
     background: Annotated[float, Field(ge=1e-4, le=1000)] = Field(
         default=0.375,
-        description="mean photoelectrons of a pixel without atoms: stray light, dark current, clock-induced "
-        "charge",
+        description="mean photoelectrons of a pixel without atoms (stray light, dark current, clock-induced "
+        "charge)",
     )
     filling: Fraction = Field(
         default=0.75,
-        description="fraction of the sites that hold atoms: how much light neighbours are expected to give",
+        description="fraction of the sites that hold atoms, which sets the expected light of neighbours",
     )
     offset: float = Field(default=500.0, description="counts of a dark pixel")
     counts_per_photoelectron: PositiveFloat = Field(
-        default=60.0, description="mean counts of one photoelectron: the EM gain over the electrons per count"
+        default=60.0,
+        description="mean counts of one photoelectron, which are the EM gain over the electrons per count",
     )
     read_noise: NonNegativeFloat = Field(
-        default=16.0, description="read noise in counts r.m.s.; rounding to whole counts is added"
+        default=16.0, description="read noise in counts r.m.s., to which rounding to whole counts is added"
     )
     em_register: bool = Field(
         default=True,
@@ -66,14 +67,14 @@ class WeightedSettings(SiteSettings):
     )
     threshold: Thresholds = Field(
         default=0.0,
-        description="log-odds above which there is an atom; lower misses fewer atoms and imagines more; used "
-        "unless a calibration of thresholds is in use: one number, one for each site (rows of numbers), or "
-        "the path of a .npy file with one for each site",
+        description="log-odds above which there is an atom, used unless a calibration of thresholds is in "
+        "use; a lower value misses fewer atoms and imagines more; one number, rows of numbers (one per "
+        "site), or the path of a .npy file with one per site",
     )
     width: PositiveFloat = Field(
         default=2.0,
         description="distance of the log-odds from the threshold at which the confidence reaches 0.76; "
-        "with 2 the confidence is that of the likelihood",
+        "with 2 the confidence follows the likelihood",
     )
 
 
@@ -88,7 +89,7 @@ class Weights:
             and whose neighbours have their mean light.
         starts: int64 (n_sites + 1,), where a site's neighbours start in the lists.
         neighbours: int64 (n,), sites whose light reaches it.
-        effects: float64 (n,), log-odds added by an atom there.
+        effects: float64 (n,), log-odds added by an atom on the neighbour.
         expected: float64 (n_sites,), mean log-odds added by its neighbours.
     """
 
@@ -104,26 +105,23 @@ class Weights:
 class WeightedDetector(ComparingDetector):
     """Adds up the log-odds of an atom, pixel by pixel, and compares with a threshold.
 
-    The optimum is that of Neyman and Pearson (Phil. Trans. R. Soc. A 231, 289, 1933):
-    among all detectors with the same rate of false positives, the likelihood ratio misses
-    the fewest atoms. A curve converts the counts of a pixel: linear for a few photoelectrons,
-    flatter for many, because the EM register makes large counts less informative. Each pixel
-    of a site has a weight: the difference of the log-likelihoods of the pixel's light with
-    and without the site's atom, at the site's true position between the pixels (see
+    Among all detectors with the same rate of false positives, the likelihood ratio misses the fewest atoms
+    (Neyman and Pearson, Phil. Trans. R. Soc. A 231, 289, 1933). A curve converts the counts of a pixel. It is
+    linear for a few photoelectrons and flatter for many, because the EM register makes large counts less
+    informative. The weight of each pixel of a site is the difference of the log-likelihoods of the pixel's
+    light with and without the site's atom, at the site's true position between the pixels (see
     :func:`labseq.detection.weighted.evidence`).
 
-    Both cases contain the mean light of the neighbours, so that a pixel in their light
-    weighs less. A second pass corrects for the neighbours found in the first: it subtracts
-    the mean effect of each, as in the detection of many senders on one channel (Verdu,
-    Multiuser Detection, 1998, chapter 7). Neighbours are those within the reach of spot and
+    Both cases contain the mean light of the neighbours, so a pixel in their light weighs less. A second pass
+    subtracts the mean effect of each neighbour found in the first, as in the detection of many senders on one
+    channel (Verdu, Multiuser Detection, 1998, chapter 7). Neighbours are those within the reach of spot and
     region, on any lattice.
 
-    The confidence is ``tanh(|log-odds - T_ij| / width)``; at T = 0 and the width of 2 it is the
-    probability of being right, scaled to 0..1, if half of the sites hold atoms.
+    The confidence is ``tanh(|log-odds - T_ij| / width)``. At T = 0 and a width of 2 it is the probability of
+    being right, scaled to 0..1, if half of the sites hold atoms.
 
     Args:
-        settings: A threshold given as text is the path
-            of a .npy file of floats (n_rows, n_cols), read here.
+        settings: A threshold given as text is the path of a .npy file of floats (n_rows, n_cols).
         context: Grid, calibrations and name.
 
     Raises:
@@ -141,7 +139,7 @@ class WeightedDetector(ComparingDetector):
         self._kernels: Any = None
 
     def warm(self) -> None:
-        """Compute the weights; compile the kernels, or load them from the cache."""
+        """Compute the weights, and compile the kernels or load them from the cache."""
         self._ready()
 
     def signals(self, frame: Frame) -> Floats:
@@ -174,7 +172,7 @@ def site_weights(settings: WeightedSettings, known: KnownSites, corners: NDArray
     sites = known.positions_px.reshape(-1, 2)
     spot_px, region, filling = settings.spot / settings.pixel_size, settings.region, settings.filling
     own_light = settings.photoelectrons * spot_light(sites, corners, region, spot_px)
-    # light further than 4 widths from a spot is left out
+    # light further than 4 widths from a spot does not count
     pairs = pairs_within(sites, (region / 2 + 4.0 * spot_px) * np.sqrt(2))
     neighbour_light = settings.photoelectrons * spot_light(
         sites[pairs[:, 1]], corners[pairs[:, 0]], region, spot_px
@@ -193,7 +191,7 @@ def site_weights(settings: WeightedSettings, known: KnownSites, corners: NDArray
     pixels = gained(likelihood.weight, dark, own_light)
     effects = np.zeros(len(pairs))
     without = dark[pairs[:, 0]] - filling * neighbour_light
-    for before in (without, without + own_light[pairs[:, 0]]):  # whether the site holds an atom or not
+    for before in (without, without + own_light[pairs[:, 0]]):  # without and with an atom on the site
         effects += (pixels[pairs[:, 0]] * gained(likelihood.mean, before, neighbour_light)).sum(
             axis=(1, 2)
         ) / 2
@@ -214,14 +212,14 @@ def site_weights(settings: WeightedSettings, known: KnownSites, corners: NDArray
 class LightLikelihood:
     """The log-likelihood of counts x under light lam, as ``weight(lam) * curve(x) + constant(lam)``.
 
-    Terms that depend on x alone are left out: they do not depend on the light.
+    Terms that depend on x alone are left out.
 
     Attributes:
         light: float64 (n,), mean photoelectrons of a pixel, rising.
-        weight: float64 (n,), at each of them.
-        constant: float64 (n,), at each of them.
-        mean: float64 (n,), mean of the curve at each of them.
-        curve: float32 (65536,), by counts; 0 at the offset, 1 higher for the counts of one photoelectron.
+        weight: float64 (n,), at each light.
+        constant: float64 (n,), at each light.
+        mean: float64 (n,), mean of the curve at each light.
+        curve: float32 (65536,), by counts. 0 at the offset, 1 higher for the counts of one photoelectron.
     """
 
     light: Floats
@@ -234,18 +232,17 @@ class LightLikelihood:
 def evidence(sensor: WeightedSettings, darkest: float, brightest: float) -> LightLikelihood:
     """Compute the log-likelihood of light between two limits, for all counts.
 
-    The number of photoelectrons is Poisson; with an EM register of high gain each
-    is multiplied by an exponentially distributed gain, so that k of them follow a gamma
-    distribution of order k (Basden, Haniff, Mackay, MNRAS 345, 985, 2003); read noise is Gaussian.
-    The ratio of the likelihood to that of the darkest light is a function of light and
-    counts. The best approximation of its logarithm by one product and a constant is the first term
-    of its singular value decomposition, counts weighted by how often they occur.
-    Without EM register and read noise it is exact: the product is k log(light).
+    The number of photoelectrons is Poisson, and read noise is Gaussian. With an EM register of high gain each
+    is multiplied by an exponentially distributed gain, so that k of them follow a gamma distribution of order
+    k (Basden, Haniff, Mackay, MNRAS 345, 985, 2003). The ratio of the likelihood to the likelihood of the
+    darkest light is a function of light and counts. The best approximation of its logarithm by one product
+    and a constant is the first term of its singular value decomposition, with counts weighted by how often
+    they occur. Without EM register and read noise it is exact, with the product k log(light).
 
     Args:
-        sensor: Settings of the detector, of which those of the camera are used.
+        sensor: Settings of the detector. Its camera settings are used.
         darkest: Minimum mean photoelectrons of a pixel, more than 0.
-        brightest: Maximum.
+        brightest: Maximum mean photoelectrons of a pixel.
     """
     light = np.concatenate([[darkest], darkest + np.geomspace(1e-3, 1.0, 64 - 1) * (brightest - darkest)])
     noise = np.hypot(sensor.read_noise, np.sqrt(1 / 12)) / sensor.counts_per_photoelectron  # rounding
@@ -270,7 +267,7 @@ def evidence(sensor: WeightedSettings, darkest: float, brightest: float) -> Ligh
 
 
 def _signals(em_register: bool, noise: float, n_most: int) -> Floats:
-    """Signals in photoelectrons: finely spaced where read noise matters, up to the largest that occurs."""
+    """Signals in photoelectrons, finely spaced where read noise matters, up to the largest that occurs."""
     low = 5 * noise
     if em_register:
         high = n_most + 6 * np.sqrt(2 * n_most) + low
@@ -321,7 +318,7 @@ def pairs_within(positions: NDArray[np.float64], distance: float) -> NDArray[np.
 
     Args:
         positions: float64 (n, 2).
-        distance: In the same unit.
+        distance: The distance, in the same unit.
 
     Example:
         >>> import numpy as np

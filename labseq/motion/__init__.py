@@ -1,6 +1,6 @@
-"""From a plan to the tones of the mobile tweezers; :mod:`labseq.motion.rendering` makes samples of them.
+"""Turns a plan into the tones of the mobile tweezers. :mod:`labseq.motion.rendering` makes samples of them.
 
-Importing this package imports no numba: the kernels come with the first call, or with :func:`warm`.
+Importing this package imports no numba. The kernels come with the first call, or with :func:`warm`.
 """
 
 import importlib

@@ -1,7 +1,7 @@
 """Tone frequencies of the sites: combs, offsets, amplitudes and limits.
 
-Positions are along the axis in the atom plane, from the grid's centre: along a1 for
-the columns' tones, along a2 for the rows'.
+Positions are along the axis in the atom plane, from the grid's centre. The axis of the column tones is a1,
+and that of the row tones is a2.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class CombFit:
     """The equally spaced comb nearest to the tones of an axis, and how far they are from it.
 
     Attributes:
-        frequency_hz: float64 (n_sites,), frequencies of the comb.
-        error_m: float64 (n_sites,), how far the comb puts each tweezer from where its
-            own frequency would, in the atom plane, in metres.
+        frequency_hz: float64 (n_sites,), frequencies of the comb at the sites.
+        error_m: float64 (n_sites,), distance of each tweezer on the comb from its place with its own
+            frequency, in the atom plane, in metres.
     """
 
     frequency_hz: Floats
@@ -58,7 +58,7 @@ def fit_comb(site_hz: Floats, spacing_m: float) -> CombFit:
     step_hz = float(site @ site_hz / (site @ site))
     comb_hz = site_hz.mean() + step_hz * site
     off_hz = comb_hz - site_hz
-    if np.abs(off_hz).max() <= 1e-6:  # nothing but rounding
+    if np.abs(off_hz).max() <= 1e-6:  # only rounding
         return CombFit(site_hz, np.zeros(n_sites))
     return CombFit(comb_hz, off_hz / step_hz * spacing_m)
 
@@ -68,7 +68,7 @@ AxisIndex = Literal[0, 1]
 AXES: Final = ("row", "column")
 
 ROUNDING: Final = 1e-9
-"""Relative excess over a limit that rounding of sums can cause."""
+"""Relative amount by which rounding of sums can exceed a limit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,12 +76,12 @@ class Drive:
     """Frequencies and amplitudes of an axis at its sites, and its limits.
 
     Attributes:
-        site_hz: float64 (n_sites,), frequency of each site; on a comb if that is near enough.
-        step_hz: Mean step from site to site; that of the other axis where there is a single one.
-        comb_error_m: float64 (n_sites,), how far tones were moved to be on the comb, in the atom
-            plane; zeros if they were not moved.
+        site_hz: float64 (n_sites,), frequency of each site, on a comb if a comb is near enough.
+        step_hz: Mean step from site to site. An axis with a single site has the step of the other axis.
+        comb_error_m: float64 (n_sites,), how far tones were moved to be on the comb, in the atom plane. Zeros
+            if they were not moved.
         amplitude: float64 (n_sites,), amplitude of each site's tone, as a fraction of full scale.
-        is_uneven: Whether the amplitudes differ from site to site.
+        is_uneven: True if the amplitudes differ from site to site.
         phase: float64 (n_sites,), preassigned phase of each site's tone, in cycles.
         max_tones: Most tones at once.
         limits: float64 (6,), see :func:`labseq.motion.tone_kernels.first_excess`.
@@ -107,7 +107,7 @@ def drive(grid: SiteGrid, motion: MotionSpec, axis: AxisIndex) -> Drive:
         axis: 0 for the rows' tones, 1 for the columns'.
 
     Raises:
-        LimitError: Amplitudes are preassigned, but not one to each site.
+        LimitError: The number of preassigned amplitudes is not the number of sites.
     """
     rf = motion.rf
     all_hz = (grid.row_frequency_hz, grid.column_frequency_hz)
@@ -118,7 +118,7 @@ def drive(grid: SiteGrid, motion: MotionSpec, axis: AxisIndex) -> Drive:
     max_tones = (motion.max_row_tones, motion.max_column_tones)[axis]
     amplitude = _amplitudes(rf, axis, grid.shape[axis], max_tones)
     for array in (site_hz, amplitude):
-        array.flags.writeable = False  # as the kernels' signatures want them
+        array.flags.writeable = False  # the kernels' signatures require it
     return Drive(
         site_hz=site_hz,
         step_hz=step_hz,
@@ -150,7 +150,7 @@ def _amplitudes(rf: RfSpec, axis: AxisIndex, n_sites: int, max_tones: int) -> Fl
         raise LimitError(
             f"the number of preassigned {AXES[axis]} amplitudes",
             len(preassigned),
-            f"{n_sites}: one per {AXES[axis]}",
+            f"{n_sites}, one per {AXES[axis]}",
         )
     return np.array(preassigned)
 

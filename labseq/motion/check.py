@@ -1,4 +1,4 @@
-"""The check of a plan: every rule that it must keep before it is played."""
+"""Checks a plan against every rule that it must keep before it is played."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from labseq.motion.tones import default_grid, path_geometry, site_time_s
 RULES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "shape": "plan, occupancy, target and grid belong together, and no batch is empty",
-        "grid": "atoms come from the grid, and go to a site of it or to an ejection slot",
+        "grid": "atoms come from the grid, and go to a site of the grid or to an ejection slot",
         "straight": "an atom of a line batch moves along one row or one column, all along the same axis",
         "linked": "a linked batch starts from exactly the goals of the line batch before, none outside",
         "source": "an atom that is moved is there, and is moved once in a batch",
         "goal": "a goal is free once the batch's own atoms are lifted, and no two atoms share one",
         "tones": "one trajectory per tone, and no more tones than an axis can play",
-        "order": "the tones of an axis keep their order and least distance: a site, with paths the clearance",
+        "order": "the tones of an axis keep their order, and stay a site apart, or the clearance with paths",
         "parallelism": "every crossing of a row tone and a column tone counts as a tweezer",
         "crossing": "a crossing that the plan does not name picks up no atom",
-        "path": "no crossing, named or not, passes over, comes too near to or ends on an atom that stands",
+        "path": "no crossing, named or not, passes over, comes too near to or ends on an atom at rest",
         "ejection": "only the outermost atoms of a line are ejected",
     }
 )
-"""The rules of :func:`labseq.check_plan`: name -> meaning."""
+"""Meaning of each rule of :func:`labseq.check_plan`, by name."""
 
 
 def check_plan(
@@ -43,35 +43,30 @@ def check_plan(
 ) -> PlanReport:
     """Check a plan against all :data:`RULES` and work out what it will do.
 
-    Why comparing the ends is enough for ``order``: the tones of a batch start
-    together and have the same speed v until each reaches its goal. The gap of two
-    neighbours is constant while they move the same way and changes at 2v, v or
-    not at all otherwise, always with the same sign: towards each other it only
-    shrinks, apart it only grows, and after the first has arrived it goes on
-    monotonically until the second has. Where both move the same way, the gap is
-    constant until the first arrival and monotonic from then on. So the gap is
-    monotonic from start to end and never below the smaller of the two, which are
-    whole numbers of sites: it is at least one site if the order is kept. With a course
-    of the speed other than constant, and on paths from one knot to the next, all tones have made
-    the same fraction of their ways at any time, so the gap goes evenly from the one at the start
-    to the one at the end.
+    The rule ``order`` only compares the ends, for this reason. The tones of a batch start together and have
+    the same speed v until each reaches its goal. While two neighbours move the same way, their gap is
+    constant. Otherwise it changes at 2v, v or not at all, always with the same sign. It only shrinks if they
+    move towards each other and only grows if they move apart, and after the first has arrived it stays
+    monotonic until the second has. So the gap is monotonic from start to end and never below the smaller of
+    its values at the two ends. These are whole numbers of sites, so it is at least one site if the order is
+    kept. If the speed is not constant, and on paths from one knot to the next, all tones have made the same
+    fraction of their ways at any time, so the gap changes evenly from start to end.
 
     Args:
         plan: The plan.
-        occupancy: bool (n_rows, n_cols), the occupancy that it was made for.
-        target: What it is to end with; not meeting it breaks no rule.
+        occupancy: bool (n_rows, n_cols), the occupancy that the plan was made for.
+        target: The wanted pattern. A plan that misses it breaks no rule.
         degree_of_parallelism: Most tweezers on at once that the planner was allowed.
-        grid: The grid of sites; by default one of the occupancy's shape with the
-            paper's spacing.
-        motion: How the tweezers move; by default as in the paper.
+        grid: The grid of sites. By default it has the occupancy's shape and the paper's spacing.
+        motion: How the tweezers move. By default as in the paper.
         planner: Name of the planner, for the error message.
 
     Returns:
         Predicted occupancy, times and numbers of tweezers.
 
     Raises:
-        InvalidPlanError: The plan breaks a rule; it says which, where and how. Or plan,
-            target, grid or motion is something else.
+        InvalidPlanError: The plan breaks a rule, which the error names with place and cause. Or plan, target,
+            grid or motion has the wrong type.
         LimitError: The degree of parallelism is not a whole number, or below 1.
 
     Example:
@@ -127,7 +122,7 @@ def check_plan(
 
 
 def _check_types(plan: Any, target: Any, dop: Any, grid: Any, motion: Any, planner: str) -> None:
-    """Refuse arguments that a script may mix up, before they are used."""
+    """Refuse arguments of the wrong type, which a script may mix up."""
     if not isinstance(dop, (int, np.integer)):
         raise LimitError("the degree of parallelism", repr(dop), "a whole number, at least 1")
     if not isinstance(plan, Plan):

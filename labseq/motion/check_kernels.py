@@ -1,11 +1,10 @@
 """Kernels of the plan check.
 
-They take any int16 moves: no index is used before it has been tested. A goal off
-the grid ejects the atom. In all of them ``batch`` is the moves of one batch, int16 (n, 4),
-``atoms``, bool (n_rows, n_cols), is the occupancy, and ``stamp`` the number of the batch, from 1.
-``lifted`` and ``goals``, int32 (n_rows, n_cols), are the stamps of the last batches that lifted an
-atom from each site and brought one to it; ``row_goal`` and ``column_goal``, int64, are where the
-tone of each row and column goes, or NO_TONE.
+They take any int16 moves, because no index is used before it has been tested. A goal off the grid ejects the
+atom. In all of them ``batch`` holds the moves of one batch, int16 (n, 4), ``atoms``, bool (n_rows, n_cols),
+is the occupancy, and ``stamp`` is the number of the batch, from 1. ``lifted`` and ``goals``, int32 (n_rows,
+n_cols), are the stamps of the last batches that lifted an atom from each site and brought an atom to it.
+``row_goal`` and ``column_goal``, int64, are where the tone of each row and column goes, or NO_TONE.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ Ints = NDArray[np.int64]
 Moves = NDArray[np.int16]
 Stamps = NDArray[np.int32]
 Fault = tuple[int, int, int, int]
-"""Number of the fault, atom move in the batch (-1: no particular one), two numbers for the message."""
+"""Number of the fault, atom move in the batch (-1 if none in particular), two numbers for the message."""
 
 RIGHT: Final = 0
 EMPTY_BATCH: Final = 1
@@ -78,7 +77,7 @@ STAMPS: Final = "int32[:, ::1]"
 def check_shapes(batch: Moves, n_rows: int, n_cols: int, slots: int, chained: bool) -> Fault:
     """Test that each move of a batch stays on the grid and all run along one axis.
 
-    In a ``chained`` batch, one that is linked or has the next one linked to it, an atom may wait.
+    In a ``chained`` batch, which is linked to the batch before or after it, an atom may wait.
     """
     first_along_row = first_along_column = -1
     for i in range(len(batch)):
@@ -106,7 +105,7 @@ def check_sites(
 ) -> Fault:
     """Test that a batch's sources hold atoms and its goals are free once these are lifted.
 
-    ``n_before`` is the number of moves of the batch before, to which it may be linked.
+    ``n_before`` is the number of moves of the batch before, which it may be linked to.
     """
     n_rows, n_cols = atoms.shape
     if linked and len(batch) != n_before:
@@ -133,7 +132,7 @@ def check_sites(
 
 @helper_kernel("UniTuple(int64, 3)(int64[::1])")
 def tones_in_order(tone_goal: Ints) -> tuple[int, int, int]:
-    """Count the tones of an axis, and find the first two that come closer than one site (-1, -1: none)."""
+    """Count the tones of an axis, and find the first two closer than one site, or -1, -1."""
     n = 0
     before = -1
     meet, with_ = -1, -1
@@ -157,8 +156,7 @@ def check_tones(
 ) -> Fault:
     """Test that a batch needs one trajectory per tone, in order, and not too many tones.
 
-    Works out ``row_goal`` and ``column_goal``. If there is no fault, its last number is
-    the number of tweezers.
+    Fills in ``row_goal`` and ``column_goal``. Without a fault, its last number is the number of tweezers.
     """
     for row in range(len(row_goal)):
         row_goal[row] = NO_TONE
@@ -190,7 +188,7 @@ def check_tones(
 
 @helper_kernel(f"{FAULT}({ATOMS}, {STAMPS}, int64, int64[::1], int64[::1])")
 def check_line_moves(atoms: Bools, lifted: Stamps, stamp: int, row_goal: Ints, column_goal: Ints) -> Fault:
-    """Test that no crossing of two tones, named or not, meets an atom that stands.
+    """Test that no crossing of two tones, named or not, meets an atom at rest.
 
     All tones that move do so along one axis, so a crossing goes straight.
     """
@@ -223,7 +221,7 @@ GRID: Final = "bool_[:, ::1]"
 
 @helper_kernel(f"boolean({MOVES}, {GRID})")
 def move_atoms(batch: Moves, atoms: Bools) -> bool:
-    """Carry out a batch; return whether it ejects an atom."""
+    """Carry out a batch, and return True if it ejects an atom."""
     n_rows, n_cols = atoms.shape
     ejects = False
     for i in range(len(batch)):
@@ -261,7 +259,7 @@ def count_wrong(atoms: Bools, fill: Bools, clear: Bools) -> tuple[int, int]:
 
 @helper_kernel(f"{FAULT}(UniTuple(int64, 3), int64, int64, int64)")
 def count_tones(shape: Shape, max_tweezers: int, max_row_tones: int, max_column_tones: int) -> Fault:
-    """Test how many tones the paths of a batch have; without a fault the last number is that of tweezers."""
+    """Test how many tones the paths of a batch have. Without a fault the last number counts the tweezers."""
     if shape[0] < 2 or shape[1] < 1 or shape[2] < 1:
         return PATH_SHAPE, -1, 0, 0
     if shape[1] > max_row_tones:
@@ -303,7 +301,7 @@ def check_path_batch(
     slots: int,
     geometry: Floats,
 ) -> tuple[Fault, float]:
-    """Test a batch with paths of tones; without a fault the last number is that of tweezers.
+    """Test a batch with paths of tones. Without a fault the last number counts the tweezers.
 
     The second result is the sum of the longest ways of all legs, in sites.
     """
@@ -349,9 +347,10 @@ def check_lines_of_batch(
     max_column_tones: int,
     slots: int,
 ) -> Fault:
-    """Test a batch along lines; without a fault the last number is that of tweezers.
+    """Test a batch along lines. Without a fault the last number counts the tweezers.
 
-    One that ``follows`` is linked to the batch before, one that ``leads`` has the next one linked to it.
+    A batch that ``follows`` is linked to the batch before, and the next batch is linked to a batch that
+    ``leads``.
     """
     fault = check_shapes(batch, atoms.shape[0], atoms.shape[1], slots, follows or leads)
     if fault[0] == RIGHT:
@@ -404,21 +403,21 @@ def check(
         linked: bool (n_batches,).
         paths: ``path_shapes``, ``path_positions`` and ``path_off`` of :class:`labseq.model.Plan`, whose
             lengths fit together.
-        atoms: bool (n_rows, n_cols), before the plan; holds the occupancy after it.
+        atoms: bool (n_rows, n_cols), before the plan. Updated to the occupancy after it.
         max_tweezers: Maximum number of tweezers on at once.
         max_row_tones: Maximum number of row tones on at once.
         max_column_tones: Maximum number of column tones on at once.
         slots: Ejection slots on each side.
-        geometry: float64 (4,): clearance in sites, cosine of the angle between rows and columns, least
-            distance of two tones of an axis with paths, in sites, and 1 if empty tweezers may land.
-        times_s: float64 (5,): before the first batch, before each batch that is not linked,
+        geometry: float64 (4,) with the clearance in sites, the cosine of the angle between rows and columns,
+            the least distance of two tones of an axis with paths, in sites, and 1 if empty tweezers may land.
+        times_s: float64 (5,), times before the first batch, before each batch that is not linked, and of
             pick-up ramp, move by one site, drop-off ramp.
         end_s: Result, float64 (n_batches,), end of each batch.
         n_tweezers: Result, int32 (n_batches,), tweezers on in each batch.
 
     Returns:
-        The first fault, its batch and atom move (-1: none in particular), and two
-        numbers that belong to it.
+        The first fault, its batch and atom move (-1 if none in particular), and two numbers that belong to
+        it.
     """
     n_batches, n_before = len(linked), 0
     lifted = np.zeros(atoms.shape, np.int32)

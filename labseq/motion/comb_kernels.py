@@ -21,7 +21,7 @@ TOLERANCE_HZ: Final = 100.0
 """Tones closer than this to a tooth count as on it in the search for a comb, in Hz."""
 
 ENOUGH: Final = 2 / 3
-"""Part of the gaps that the spacing of a comb has to fit, of as many as any can."""
+"""A comb's spacing has to fit this fraction of the largest number of gaps that any spacing fits."""
 
 MIN_SPACING_HZ: Final = 5e4
 """Least spacing of a comb in the search, in Hz."""
@@ -40,13 +40,13 @@ def insert(values: Floats, n: int, hz: float) -> tuple[int, int]:
     """Count a value, to 1 Hz, among ``n`` rising ones.
 
     Args:
-        values: float64 (2, n_most), values and how often each came; updated. A new value for which there is
-            no room is left out.
-        n: How many there are.
+        values: float64 (2, n_most), values and how often each came. Updated. A new value without room is left
+            out.
+        n: Number of values.
         hz: The value.
 
     Returns:
-        How many there are then, one more than there is room for if it was left out; and its place.
+        The new number of values, one more than there is room for if it was left out, and its place.
     """
     hz = np.rint(hz)
     at = int(np.searchsorted(values[0, :n], hz))
@@ -64,7 +64,7 @@ def insert(values: Floats, n: int, hz: float) -> tuple[int, int]:
 def count_tones(start_hz: Floats, values: Floats) -> int:
     """Collect the different frequencies of some tones, to 1 Hz, in rising order.
 
-    Returns how many there are; -1 if they are more than ``values``, float64 (2, n_most), can hold.
+    Returns their number, or -1 if they are more than ``values``, float64 (2, n_most), can hold.
     """
     n = 0
     for k in range(len(start_hz)):
@@ -78,7 +78,7 @@ def count_tones(start_hz: Floats, values: Floats) -> int:
 def count_gaps(start_hz: Floats, end_hz: Floats, offsets: Ints, values: Floats) -> int:
     """Collect the different gaps between neighbours that go the same way in a segment, in rising order.
 
-    Returns how many there are, at most as many as ``values``, float64 (2, n_most), can hold.
+    Returns their number, at most as many as ``values``, float64 (2, n_most), can hold.
     """
     n, at, latest = 0, 0, -1.0
     for i in range(len(offsets) - 1):
@@ -99,7 +99,7 @@ def count_gaps(start_hz: Floats, end_hz: Floats, offsets: Ints, values: Floats) 
 
 @helper_kernel("Tuple((float64, float64))(float64[:, :], float64)")
 def count_multiples(gaps: Floats, spacing_hz: float) -> tuple[float, float]:
-    """Count the gaps that are a multiple of a spacing, and find the spacing that fits those best."""
+    """Count the gaps that are a multiple of a spacing, and find the spacing that fits these gaps best."""
     n, gap_hz, multiples = 0.0, 0.0, 0.0
     for i in range(gaps.shape[1]):
         multiple = np.rint(gaps[0, i] / spacing_hz)
@@ -112,7 +112,7 @@ def count_multiples(gaps: Floats, spacing_hz: float) -> tuple[float, float]:
 
 @helper_kernel("float64(float64, float64)")
 def common_measure(a: float, b: float) -> float:
-    """The largest frequency of which two are multiples, by Euclid's algorithm."""
+    """Greatest common divisor of two frequencies, by Euclid's algorithm."""
     while b > MIN_SPACING_HZ:
         a, b = b, abs(a - b * np.rint(a / b))
     return a
@@ -120,7 +120,7 @@ def common_measure(a: float, b: float) -> float:
 
 @kernel("float64(float64[:, :])")
 def common_spacing(gaps: Floats) -> float:
-    """Find the largest spacing, in Hz, of which two thirds of as many gaps as possible are a multiple.
+    """Find the largest spacing, in Hz, that divides two thirds of as many gaps as any spacing divides.
 
     Candidates are the gaps and the common measures of any two. Returns 0 if there is no gap, -1 if
     there are too many for a comb.
@@ -150,7 +150,7 @@ def common_spacing(gaps: Floats) -> float:
 
 @kernel(f"void({CONST}, {CONST}, {const('int32', 1)}, float64[::1])")
 def find_spacing(start_hz: Floats, end_hz: Floats, offsets: Ints, comb_hz: Floats) -> None:
-    """Look for a comb of tones that go the same way in a segment, or if no two do that of all tones.
+    """Look for a comb of tones that go the same way in a segment, or of all tones if no two do.
 
     ``comb_hz``, float64 (3,), is its spacing (see :func:`common_spacing`), the lowest tone, and the distance
     of the highest.
@@ -173,11 +173,10 @@ def find_spacing(start_hz: Floats, end_hz: Floats, offsets: Ints, comb_hz: Float
 
 @kernel(f"void({CONST}, {CONST}, int64, int64, float64[:, ::1])")
 def fill_teeth(cosine: Floats, sine: Floats, numerator: int, first: int, teeth: Floats) -> None:
-    """Fill in cosine and sine of each tooth of the comb of 0 Hz, from the ``first`` on, over a period.
+    """Fill in cosine and sine of each tooth of the comb of 0 Hz, from number ``first``, over a period.
 
-    The result is float64 (2 n_teeth, period). ``cosine`` and ``sine``, float64 (period,), are those of
-    one turn in steps of 1 / period; ``numerator`` is the number of turns per period from one tooth to
-    the next.
+    The result is float64 (2 n_teeth, period). ``cosine`` and ``sine``, float64 (period,), cover one turn in
+    steps of 1 / period. ``numerator`` is the number of turns per period from one tooth to the next.
     """
     period = len(cosine)
     for tooth in range(len(teeth) // 2):

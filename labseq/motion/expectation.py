@@ -1,4 +1,4 @@
-"""What a planner is expected to give: means of the predicted survival over random loadings."""
+"""Predicts the result of a planner as the mean predicted survival over random loadings."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Expected:
 
     Attributes:
         n_atoms: Number of target sites.
-        n_defects: Number of them without an atom.
-        p_defect_free: Probability that all hold one.
+        n_defects: Number of target sites without an atom.
+        p_defect_free: Probability that all target sites hold an atom.
     """
 
     n_atoms: int
@@ -49,7 +49,7 @@ def expect(
     motion: MotionSpec,
     window_s: float = math.inf,
 ) -> Expected:
-    """Plan for loadings, and predict what is left after the first cycle; losses are those of the profile.
+    """Plan for loadings, and predict what is left after the first cycle with the losses of the profile.
 
     Args:
         plan_for: The method ``plan`` of a planner.
@@ -58,7 +58,7 @@ def expect(
         degree_of_parallelism: Maximum number of tweezers on at once.
         grid: The grid of sites.
         motion: How the tweezers move, with the losses.
-        window_s: Time from the start of the cycle; batches that end later are not played.
+        window_s: Time from the start of the cycle. Batches that end later are not played.
 
     Raises:
         InvalidPlanError: A plan breaks a rule of the check.

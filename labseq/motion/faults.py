@@ -1,4 +1,4 @@
-"""Explains the faults that the checks of a plan and of its tones find."""
+"""Raises the errors for the faults that the checks of a plan and of its tones find."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ from labseq.units import format_quantity
 
 FAULTS: Final[Mapping[str, tuple[str, str]]] = {
     "EMPTY_BATCH": ("shape", "it has no atom moves; leave it out"),
-    "SOURCE_OUTSIDE": ("grid", "the source {site} lies outside of the grid of {n_rows} x {n_cols} sites"),
+    "SOURCE_OUTSIDE": ("grid", "the source {site} is outside the grid of {n_rows} x {n_cols} sites"),
     "GOAL_OUTSIDE": ("grid", "the goal {site} is neither on the grid nor within {slots} site(s) of its edge"),
     "DIAGONAL": ("straight", "{source} -> {goal} changes row and column; split it into two linked batches"),
-    "NO_LENGTH": ("straight", "{source} -> {goal} goes nowhere; only in linked batches may an atom wait"),
+    "NO_LENGTH": ("straight", "{source} -> {goal} goes nowhere; an atom may wait only in linked batches"),
     "TWO_AXES": ("straight", "atom move {a} follows a row, {b} a column, so their crossing goes diagonally"),
-    "LINKED_FIRST": ("linked", "the first batch has none before it to be linked to"),
-    "LINKED_AFTER_EJECTION": ("linked", "the batch before it ejects, and tweezers ramp down there"),
-    "LINKED_NUMBER": ("linked", "it moves {a} atoms while {b} are held from the batch before"),
+    "LINKED_FIRST": ("linked", "the first batch has no batch before it to link to"),
+    "LINKED_AFTER_EJECTION": (
+        "linked",
+        "the batch before it ejects atoms, so its tweezers ramp down at the end",
+    ),
+    "LINKED_NUMBER": ("linked", "it moves {a} atoms but the batch before holds {b}"),
     "LINKED_ELSEWHERE": ("linked", "its source {site} is not a goal of the batch before"),
     "NO_ATOM": ("source", "there is no atom on {site}"),
     "SOURCE_TWICE": ("source", "another atom move of the batch starts from {site} too"),
@@ -38,19 +41,19 @@ FAULTS: Final[Mapping[str, tuple[str, str]]] = {
         "parallelism",
         "{a} row x {b} column tones make {n_tweezers} tweezers; the limit is {limit}",
     ),
-    "CROSSING_ON_ATOM": ("crossing", "its tones cross on the atom on {site} too, which it does not name"),
-    "PATH_OVER_ATOM": ("path", "its tones cross the atom that stands on {site} on their way or at its end"),
+    "CROSSING_ON_ATOM": ("crossing", "its tones also cross on the atom on {site}, which it does not name"),
+    "PATH_OVER_ATOM": ("path", "its tones cross the atom on {site} on their way or at its end"),
     "LINKED_AFTER_PATHS": (
         "linked",
-        "it or the batch before has paths of tones; only line batches are linked",
+        "it or the batch before has paths of tones; only line batches can be linked",
     ),
     "PATH_SHAPE": ("tones", "its paths have fewer than two knots, or an axis has no tone"),
     "PATH_POSITION": ("tones", "a position of {axis} tone {b} is not finite"),
     "PATH_OFF": (
         "tones",
-        "{axis} tones go off at knots from 1 to the last, one at the last; not so tone {b}",
+        "{axis} tones go off at knots from 1 to the last, at least one at the last, but tone {b} does not",
     ),
-    "PATH_OUTSIDE": ("grid", "{axis} tone {b} goes further than {slots} site(s) beyond the grid's edge"),
+    "PATH_OUTSIDE": ("grid", "{axis} tone {b} goes more than {slots} site(s) beyond the grid's edge"),
     "PATH_ORDER": (
         "order",
         "{axis} tone {b} comes closer than {least} sites to the one before, or passes it",
@@ -58,22 +61,22 @@ FAULTS: Final[Mapping[str, tuple[str, str]]] = {
     "PATH_NO_TONE": ("tones", "no {axis} tone starts at {source}"),
     "PATH_END": (
         "tones",
-        "{source} -> {goal}, but its {axis} tone is elsewhere at knot {b}, where it is let go",
+        "{source} -> {goal}, but its {axis} tone is elsewhere at knot {b}, where the atom is dropped",
     ),
     "PATH_PICKS_UP": (
         "crossing",
-        "a tweezer that it does not name comes on at the atom on {site} or too near to it",
+        "a tweezer that it does not name switches on at the atom on {site} or too near to it",
     ),
-    "PATH_NEAR_ATOM": ("path", "a tweezer comes closer than {clearance} to the atom that stands on {site}"),
+    "PATH_NEAR_ATOM": ("path", "a tweezer comes closer than {clearance} to the atom on {site}"),
     "PATH_LANDS": (
         "path",
-        "a tweezer without an atom ends on the atom on {site}, and empty_tweezers_may_land is off",
+        "an empty tweezer ends on the atom on {site}, but empty_tweezers_may_land is off",
     ),
     "INNER_EJECTION": ("ejection", "an atom would be ejected over the one on {site}; eject that one first"),
 }
-"""Faults of :mod:`labseq.motion.check_kernels`: name -> rule, wording."""
+"""Rule and wording of each fault of :mod:`labseq.motion.check_kernels`, by name."""
 _AT_A_SITE: Final = {"INNER_EJECTION", *(name for name, (_, text) in FAULTS.items() if "{site}" in text)}
-"""The faults whose two numbers are a site."""
+"""Faults that give a site as their two numbers."""
 
 
 def raise_plan_error(
@@ -88,8 +91,8 @@ def raise_plan_error(
     """Raise the error for a fault.
 
     Args:
-        fault: Its number, as the kernels of the check give it.
-        fault_place: Its batch and atom move, or -1; and two numbers whose meaning depends on the fault.
+        fault: Number of the fault, from the kernels of the check.
+        fault_place: Its batch, its atom move or -1, and two numbers whose meaning depends on the fault.
         plan: The plan.
         grid: The grid of sites.
         max_tweezers: Most tweezers on at once.
@@ -127,13 +130,13 @@ def raise_limit_error(
     """Raise the error for an exceeded limit.
 
     Args:
-        fault: Which limit, as ``first_excess`` of the kernels gives it.
-        value: What exceeds it: a frequency or distance in Hz, a sum of amplitudes or of their squares.
+        fault: Number of the limit, from ``first_excess`` of the kernels.
+        value: The excessive value, which is a frequency or distance in Hz, or a sum of amplitudes or squares.
         axis: 0 for the rows' tones, 1 for the columns'.
         tone: The tone, from 0 in its segment.
         n_tones: Number of tones of the segment.
         batch: Its batch.
-        rf: The limits in the words of the profile.
+        rf: The limits, as the profile states them.
     """
     name = AXES[axis]
     frequency, rf_settings = ("grid", f"{name}_frequency"), ("mobile_tweezers", "rf")
@@ -156,12 +159,12 @@ def raise_limit_error(
     if fault == AMPLITUDES and rf.full_scale_v > rf.max_peak_v:
         quantity = f"the peak voltage of {all_tones}"
         amount = format_quantity(value * rf.full_scale_v, "voltage")
-        limit = f"{format_quantity(rf.max_peak_v, 'voltage')}: more ruins the amplifier"
+        limit = f"{format_quantity(rf.max_peak_v, 'voltage')}, because more ruins the amplifier"
         raise LimitError(quantity, amount, limit, setting=rf_settings)
     if fault == AMPLITUDES:
         quantity = f"the sum of the amplitudes of {all_tones}"
         raise LimitError(
-            quantity, f"{value:.6g} of full scale", "1: the output would clip", setting=rf_settings
+            quantity, f"{value:.6g} of full scale", "1, because the output would clip", setting=rf_settings
         )
     power_w = value * rf.full_scale_power_w
     limit = f"{format_quantity(rf.max_mean_power_w, 'power')} at the AOD"

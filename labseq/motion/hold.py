@@ -1,4 +1,4 @@
-"""Programs whose tones stand still: to probe the overlay with atoms, and to measure the tweezers' light."""
+"""Programs without movement, which probe the overlay with atoms and measure the tweezers' light."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Batch:
-    """Tones that are on together, those of rows and of columns; ``offset_m`` float64 (2,) along a1 and a2."""
+    """Row and column tones that are on together. ``offset_m`` is float64 (2,), along a1 and a2."""
 
     rows: Ints
     columns: Ints
@@ -31,7 +31,7 @@ class _Batch:
 
 @dataclass(frozen=True, slots=True)
 class _Segment:
-    """A segment of each batch; the amplitudes at its two ends are fractions of the full one."""
+    """A segment of each batch, with amplitudes at its two ends as fractions of the full amplitude."""
 
     kind: SegmentKind
     time_s: float
@@ -49,28 +49,27 @@ def hold_program(
 ) -> ToneProgram:
     """Pick atoms up, hold them and drop them, all displaced from their sites by an offset.
 
-    Nothing is moved: the tones of a batch stand still, at the frequencies of their sites and an
-    offset more. Amplitudes, phases and, but for the drop-off, times are those of
-    :func:`labseq.motion.tone_program`; the columns' tones are ramped. A batch holds atoms of one row
-    that have the same offset, so that each crossing is a site that was asked for, as many at once
-    as the motion allows. A drop-off that is fast against the swing of the atoms lets go of them where
-    they are; a slow one leads many of them back.
+    Nothing moves. The tones of a batch stay at the frequencies of their sites plus an offset. Amplitudes,
+    phases and times, except for the drop-off, are as in :func:`labseq.motion.tone_program`, and the columns'
+    tones are ramped. A batch holds atoms of one row that have the same offset, as many at once as the motion
+    allows, so that tones cross only on requested sites. A drop-off that is fast compared with the swing of
+    the atoms releases them where they are. A slow drop-off leads many of them back.
 
     Args:
         grid: The grid of sites.
-        motion: How the tweezers move: ramps, overheads, and limits.
+        motion: Ramps, overheads and limits of the tweezers.
         sites: bool (n_rows, n_cols), the sites to hold.
-        offset_m: Offset of each tweezer from its site, along a1 (the columns' tones)
-            and a2 (the rows'): (2,) for all, or (n_rows, n_cols, 2).
-        hold_s: Time between the ramps, in seconds; 0 for none.
-        drop_off_s: Duration of the drop-off, in seconds; by default the motion's.
+        offset_m: Offset of each tweezer from its site, along a1 (the columns' tones) and a2 (the rows').
+            Shape (2,) for all, or (n_rows, n_cols, 2).
+        hold_s: Time between the ramps, in seconds, or 0.
+        drop_off_s: Duration of the drop-off, in seconds. By default the motion's.
 
     Returns:
-        The tones of both axes; a batch for each row and offset, or more.
+        The tones of both axes, with one or more batches for each row and offset.
 
     Raises:
         LimitError: A tone leaves its band, comes too near to another, or breaks another limit.
-        ValueError: Sites or offsets are not of the grid's shape, or a value is not a number.
+        ValueError: Sites or offsets do not have the grid's shape, or a value is not a number.
     """
     _check_band(grid, motion, sites, offset_m)
     batches = list(_batches(grid, motion, sites, offset_m))
@@ -82,7 +81,7 @@ def all_on_program(grid: SiteGrid, motion: MotionSpec, on_s: float) -> ToneProgr
 
     Args:
         grid: The grid of sites.
-        motion: How the tweezers move: ramps, amplitudes and limits.
+        motion: Ramps, amplitudes and limits of the tweezers.
         on_s: Time between the ramps, in seconds, more than 0.
 
     Returns:
@@ -108,10 +107,10 @@ def hold_time_s(
     hold_s: float,
     drop_off_s: float | None = None,
 ) -> float:
-    """Longest playing time of a :func:`hold_program`: that for every site of the grid.
+    """Longest playing time of a :func:`hold_program`, which holds every site of the grid.
 
     Raises:
-        LimitError: The tone of a site leaves its band at its offset.
+        LimitError: The offset moves the tone of a site out of its band.
     """
     all_sites = np.ones(grid.shape, np.bool_)
     _check_band(grid, motion, all_sites, offset_m)
@@ -122,8 +121,8 @@ def hold_time_s(
 def cross_offsets_m(shape: tuple[int, int], offset_m: ArrayLike) -> Floats:
     """Offsets of four groups of sites: +x and -x along a1 in even rows, +y and -y along a2 in odd ones.
 
-    In even rows even columns go forward and odd ones back; in odd rows likewise. So each group
-    holds a quarter of the sites, spread over the whole grid.
+    In each row, even columns go forward and odd columns back. So each group holds a quarter of the sites,
+    spread over the whole grid.
 
     Args:
         shape: (n_rows, n_cols).
@@ -143,7 +142,7 @@ def cross_offsets_m(shape: tuple[int, int], offset_m: ArrayLike) -> Floats:
 
 
 def _check_band(grid: SiteGrid, motion: MotionSpec, sites: Mask, offset_m: ArrayLike) -> None:
-    """Refuse an offset at which the tone of a site leaves its band; needs no kernel."""
+    """Refuse an offset at which the tone of a site leaves its band, without a kernel."""
     if np.shape(sites) != grid.shape:
         raise ValueError(f"sites has shape {np.shape(sites)}; expected {grid.shape}")
     offsets = np.broadcast_to(np.asarray(offset_m, np.float64), (*grid.shape, 2))
@@ -181,7 +180,7 @@ def _batches(grid: SiteGrid, motion: MotionSpec, sites: Mask, offset_m: ArrayLik
 
 
 def _segments(motion: MotionSpec, hold_s: float, drop_off_s: float | None = None) -> list[_Segment]:
-    """The segments of a batch; the rows' tones are keyed, as those of the parked axis of a move."""
+    """The segments of a batch. The rows' tones are keyed, like the tones of the parked axis in a move."""
     drop_off_s = motion.drop_off_s if drop_off_s is None else drop_off_s
     for name, time_s in (("hold", hold_s), ("drop off", drop_off_s)):
         if not 0 <= time_s < float("inf"):

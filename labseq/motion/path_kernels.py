@@ -1,10 +1,10 @@
-"""Kernels that check one batch with paths of tones; see :class:`labseq.model.TonePaths`.
+"""Kernels that check one batch with paths of tones, which are :class:`labseq.model.TonePaths`.
 
-In all of them ``shape`` is the number of knots, of row tones and of column tones. ``positions``,
-float64, holds the position of each row tone at knot 0, at knot 1 and so on, then those of the column
-tones; ``tracks`` is the same tone by tone; ``off``, int32, the knot at which each row tone goes off, then
-each column tone. Positions and ways are in sites; ``cosine`` is that of the angle between rows and columns.
-``stands_from``, int32 (n_rows, n_cols), is the leg from which an atom stands on each site. For ``stamp`` and
+In all of them ``shape`` is the number of knots, of row tones and of column tones. ``positions``, float64,
+holds the positions of all row tones at knot 0, at knot 1 and so on, and then of all column tones. ``tracks``
+holds the same tone by tone. ``off``, int32, is the knot at which each row tone goes off, then each column
+tone. Positions and ways are in sites. ``cosine`` belongs to the angle between rows and columns.
+``stands_from``, int32 (n_rows, n_cols), is the leg from which an atom rests on each site. For ``stamp`` and
 ``lifted`` see :mod:`labseq.motion.check_kernels`. The last two numbers of a fault are a site, or axis and
 tone.
 """
@@ -78,7 +78,7 @@ def paths_of(paths: Paths, number: int, start: int, off_start: int) -> tuple[Flo
 
 @helper_kernel(f"float64({POSITIONS}, {SHAPE}, int64, int64, int64)")
 def position(positions: Floats, shape: Shape, axis: int, knot: int, tone: int) -> float:
-    """Position of a tone of an axis (0: rows, 1: columns) at a knot."""
+    """Position of a tone of an axis (0 for rows, 1 for columns) at a knot."""
     first = axis * shape[0] * shape[1]
     return float(positions[first + knot * shape[1 + axis] + tone])
 
@@ -116,7 +116,7 @@ def tracks_of(positions: Floats, shape: Shape) -> Tracks:
 def extreme_ways(track: Floats, off: Ints) -> tuple[Floats, Floats]:
     """The lowest and the highest way, with its sign, of an axis' tones on each leg, float64 (n_knots - 1,).
 
-    Only tones count that are on; ``off``, int32 (n_tones,), says until when.
+    Only tones that are on count. ``off``, int32 (n_tones,), says until when.
     """
     n_tones, n_knots = track.shape
     least, most = np.full(n_knots - 1, math.inf), np.full(n_knots - 1, -math.inf)
@@ -132,7 +132,7 @@ def extreme_ways(track: Floats, off: Ints) -> tuple[Floats, Floats]:
 def leg_ways(tracks: Tracks, off: Ints, cosine: float) -> Floats:
     """The longest way of any tweezer from each knot to the next, float64 (n_knots - 1,).
 
-    A length is a convex function of its parts, so that only the extremes of each axis matter.
+    A length is a convex function of its parts, so only the extremes of each axis matter.
     """
     n_rows = len(tracks[0])
     up, down = extreme_ways(tracks[0], off[:n_rows])
@@ -150,10 +150,10 @@ def leg_ways(tracks: Tracks, off: Ints, cosine: float) -> Floats:
 
 @helper_kernel(f"{FAULT}(float64[:, ::1], {KNOTS}, int64, int64, int64, float64)")
 def check_axis(track: Floats, off: Ints, axis: int, n_sites: int, slots: int, least: float) -> Fault:
-    """Test the paths of the tones of an axis: numbers that mean something, the band, and their order.
+    """Test that the paths of the tones of an axis have meaningful numbers, stay near the grid and keep order.
 
-    From knot to knot the distance of two tones changes evenly, so that it is least at a knot. ``off``,
-    int32 (n_tones,), is the knot at which each tone goes off.
+    From knot to knot the distance of two tones changes evenly, so it is least at a knot. ``off``, int32
+    (n_tones,), is the knot at which each tone goes off.
     """
     n_tones, n_knots = track.shape
     lowest, highest, latest = -slots, n_sites - 1 + slots, 0
@@ -183,7 +183,7 @@ def check_axis(track: Floats, off: Ints, axis: int, n_sites: int, slots: int, le
 
 @helper_kernel("int64(float64[:, ::1], int64)")
 def find_tone(track: Floats, site: int) -> int:
-    """The tone of an axis that starts on a site; -1 if there is none."""
+    """The tone of an axis that starts on a site, or -1."""
     for tone in range(len(track)):
         if track[tone, 0] == site:
             return tone
@@ -192,7 +192,7 @@ def find_tone(track: Floats, site: int) -> int:
 
 @helper_kernel(f"void({const('bool_', 2)}, {STAMPS}, int64, {STAMPS})")
 def fill_stands_from(atoms: Bools, lifted: Ints, stamp: int, stands_from: Ints) -> None:
-    """Fill in the leg from which an atom stands on each site: 0 if it stays there, else NEVER."""
+    """Fill in the leg from which an atom rests on each site, 0 if it stays there, else NEVER."""
     for row in range(atoms.shape[0]):
         for col in range(atoms.shape[1]):
             stays = atoms[row, col] and lifted[row, col] != stamp
@@ -243,7 +243,7 @@ def find_near(
     cosine: float,
     spared: tuple[int, int],
 ) -> tuple[int, int]:
-    """Find an atom that stands during a leg and is too near to a way; NOWHERE if there is none.
+    """Find an atom that rests during a leg and is too near to a way, or return NOWHERE.
 
     Args:
         stands_from: See :func:`fill_stands_from`.
@@ -295,8 +295,8 @@ def mark_near_legs(
     """Mark the legs of a tweezer on which it may come too near to a site.
 
     If a point of a leg of length l has the distance d from a site, one of its ends has at most the root of
-    d^2 + l^2 / 4 (Stewart's theorem). The four sites around that end are enough: one of them is within 0.71
-    spacings, and all others are beyond the next lines, 0.87 or more away.
+    d^2 + l^2 / 4 (Stewart's theorem). The four sites around that end are enough, because one of them is
+    within 0.71 spacings, and all others are beyond the next lines, 0.87 or more away.
 
     Args:
         down: float64 (n_knots,), its row.
@@ -330,11 +330,11 @@ def check_leg(
         down: float64 (n_knots,), its row.
         right: float64 (n_knots,), its column.
         leg: The leg.
-        lands: Whether it goes off then, without an atom.
+        lands: True if it goes off after the leg, without an atom.
         stands_from: See :func:`fill_stands_from`.
         clearance: Least distance.
         cosine: Of the angle between rows and columns.
-        may_land: Whether an empty tweezer may end on an atom.
+        may_land: True if an empty tweezer may end on an atom.
     """
     to_row, to_col = down[leg + 1], right[leg + 1]
     spared = NOWHERE
@@ -363,10 +363,10 @@ def check_motion(
     cosine: float,
     may_land: bool,
 ) -> Fault:
-    """Test that no tweezer, named or not, comes too near to an atom that stands, from pick-up to drop-off.
+    """Test that no tweezer, named or not, comes too near to an atom at rest, from pick-up to drop-off.
 
-    While tones are ramped the tweezers stand where a leg ends and the next starts, and atoms that have
-    just been dropped off count in the next leg. So nothing happens at a knot that the legs do not show.
+    While tones are ramped the tweezers rest where a leg ends and the next starts, and atoms that have just
+    been dropped off count in the next leg. So nothing happens at a knot that the legs do not show.
     """
     n_rows, n_cols = lifted.shape
     all_down, all_right = tracks
@@ -405,7 +405,7 @@ def check_motion(
 
 
 ON_SITE: Final = 0.1
-"""A tweezer that comes as near to a site, in spacings, ends there: it lands."""
+"""A tweezer that ends this near to a site, in spacings, lands on it."""
 
 
 @helper_kernel(
@@ -422,18 +422,18 @@ def add_passes(
     of_site: Floats,
     of_tweezer: Floats,
 ) -> int:
-    """Weigh passes of standing atoms by their distance, each pair once, at its nearest; return how many.
+    """Count passes of atoms at rest, and weigh each pair once, by its least distance.
 
     Args:
         positions: The paths.
         off: Likewise.
         shape: Likewise.
-        atoms: bool (n_rows, n_cols), the atoms that stand.
+        atoms: bool (n_rows, n_cols), the atoms at rest.
         cosine: Of the angle between rows and columns.
-        distances: In spacings: from where on a tweezer does not pass, where the weight is 1, and the
-            additional distance at which it is 1/e.
+        distances: In spacings, the distance from which a tweezer does not pass, the distance at which the
+            weight is 1, and the additional distance at which it is 1/e.
         of_site: float64 (n_rows, n_cols), to which the weights of each site are added.
-        of_tweezer: float64 (n_row_tones, n_column_tones), to which those of each tweezer are added.
+        of_tweezer: float64 (n_row_tones, n_column_tones), to which the weights of each tweezer are added.
     """
     n_rows, n_cols = atoms.shape
     beside, full, decay = distances

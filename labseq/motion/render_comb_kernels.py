@@ -10,15 +10,15 @@ at x samples from the start of the segment. In a strip, from x_0 on, x = x_0 + j
     Re[P(j) exp 2 pi i (psi + (nu + gamma x_0) j) exp(pi i gamma j^2)]
     P(j) = sum_k a_k exp 2 pi i (phi_k + m_k mu j)
 
-P repeats itself after the comb's period, M samples with M mu whole. It is worked out once for as long as the
-tones stay together: from segment to segment only psi changes, and where P starts. Times the wave, whose
-frequency is constant in the strip, it is the table of the strip, a period long: from period to period its
-phase changes. The last factor is the same in all strips of tones of one speed, and kept. All this is worked
-out in float64 and multiplied in float32: a parked group costs two operations per sample, a moving one six.
+P repeats itself after the comb's period, which is M samples with M mu whole. It is computed once for as long
+as the tones stay together, because from segment to segment only psi and the start of P change. P times the
+wave, whose frequency is constant in the strip, is the table of the strip. The table is one period long, and
+its phase changes from period to period. The last factor is the same in all strips of tones of one speed, and
+is kept. All this is computed in float64 and multiplied in float32. A parked group costs two operations per
+sample, and a moving group six.
 
-The loops are written for the compiler: only where an index cannot be negative and few
-arrays are written to does it use vector instructions; hence the slices and the split loops, and no
-conditions within them.
+The loops have slices, are split and contain no conditions because the compiler uses vector instructions only
+where an index cannot be negative and few arrays are written to.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def times(a_re: float, a_im: float, b_re: float, b_im: float) -> Complex:
 
 @helper_kernel(f"UniTuple(float64, 2)(float64, {F64}, {F64})", fused=True)
 def fill_powers(cycles: float, re: Floats, im: Floats) -> Complex:
-    """Fill in exp(2 pi i cycles r), r = 0 ... n - 1, where n is a power of 2; return the next one."""
+    """Fill in exp(2 pi i cycles r), r = 0 ... n - 1, for n a power of 2, and return the value for r = n."""
     x, y = turn(cycles)
     re[0], im[0] = 1.0, 0.0
     done = 1
@@ -151,13 +151,13 @@ def fill_chirp(chirp: float, n: int, re: Singles, im: Singles, lanes: Floats) ->
 
 @helper_kernel(f"int64(float64, float32[:, :, ::1], {F64}, float64[:, ::1])")
 def find_chirp(chirp: float, chirps: Singles, keys: Floats, lanes: Floats) -> int:
-    """Find or fill in exp(pi i chirp j^2) for a strip, which many segments share.
+    """Find exp(pi i chirp j^2) for a strip, which many segments share, or fill it in.
 
     Args:
-        chirp: In cycles per sample squared; rounded to a grid that makes no difference in a strip.
-        chirps: float32 (N_CHIRPS, 2, >= STRIP + LANES), those that there are; updated.
-        keys: float64 (N_CHIRPS + 1,), each of them, and how many were filled in; updated.
-        lanes: Scratch, see :func:`fill_chirp`.
+        chirp: In cycles per sample squared. Rounded to a grid that makes no difference in a strip.
+        chirps: float32 (N_CHIRPS, 2, >= STRIP + LANES), the cached chirps. Updated.
+        keys: float64 (N_CHIRPS + 1,), each cached chirp, and how many were filled in. Updated.
+        lanes: Scratch of :func:`fill_chirp`.
 
     Returns:
         Its index in ``chirps``.
@@ -184,9 +184,9 @@ def add_parked(
     now: Complex,
     by: Complex,
 ) -> None:
-    """Add a group at rest, multiplied by ``now``, to ``n`` samples; see :func:`add_moving`.
+    """Add a group at rest, multiplied by ``now``, to ``n`` samples, with arguments as in :func:`add_moving`.
 
-    ``offset`` is where in the table the first sample is.
+    ``offset`` is the place of the first sample in the table.
     """
     x, y = now
     for q in range((n + CHUNK - 1) // CHUNK):
@@ -214,12 +214,12 @@ def add_moving(
     """Add a moving group to ``n`` samples, rounded up to whole chunks.
 
     Args:
-        acc: The samples; updated.
-        n: How many.
+        acc: The samples. Updated.
+        n: Number of samples.
         re: Real part of the table, float32 (>= min(period, n) + CHUNK,).
         im: Its imaginary part.
         period: Its period.
-        by: By which it is multiplied from period to period.
+        by: Factor from period to period.
         chirp_re: Real part of the chirp, float32 (>= n + CHUNK,).
         chirp_im: Its imaginary part.
     """
@@ -247,11 +247,11 @@ def blend(
 
     Args:
         tables: float32 (N_ROWS, ...), real and imaginary part of the coefficient of each power.
-        n: How many samples, rounded up to whole chunks.
+        n: Number of samples, rounded up to whole chunks.
         period: Period of the tables.
-        by: By which they are multiplied from period to period.
+        by: Their factor from period to period.
         u: Fraction of the segment that has passed at the first sample.
-        per_sample: What is added from sample to sample.
+        per_sample: Increase of ``u`` from sample to sample.
         blended: Result, float32 (2, >= n + CHUNK).
     """
     x, y, offset = 1.0, 0.0, 0
@@ -302,7 +302,7 @@ def add_to_sums(words: Words, i: int, k: int, anchor: int, shared: bool, n_sums:
 
 @helper_kernel("int64(int64[:, ::1], int64, int64)")
 def find_sums(keys: Words, number: int, anchor: int) -> int:
-    """Where the sums of a group are in the workspace, by its first tone; -1 if they are not there."""
+    """Place of the sums of a group in the workspace, by its first tone, or -1 if they are not there."""
     for at in range(N_KEPT):
         if keys[at, 0] == number and keys[at, 1] == anchor:
             return at
@@ -322,7 +322,7 @@ def find_all_sums(words: Words, i: int) -> None:
         if anchor < 0 or find_sums(keys, number, anchor) >= 0:
             continue
         at = keys[N_KEPT, 0]
-        while keys[at, 0] == number and keys[at, 2] == i:  # the segment needs it, too
+        while keys[at, 0] == number and keys[at, 2] == i:  # the segment also needs it
             at = (at + 1) % N_KEPT
         keys[at, 0], keys[at, 1], keys[at, 2] = number, anchor, i
         keys[N_KEPT, 0] = (at + 1) % N_KEPT
@@ -331,9 +331,9 @@ def find_all_sums(words: Words, i: int) -> None:
 
 @helper_kernel(f"void({WORDS}, int64, int64)")
 def fill_sums(words: Words, anchor: int, at: int) -> None:
-    """Fill in the sums of the group whose first tone is ``anchor``, the workspace's number ``at``.
+    """Fill in the sums of the group whose first tone is ``anchor`` at place ``at`` of the workspace.
 
-    They are those of two periods and more from the first sample of its segment on.
+    They cover two periods or more from the first sample of its segment.
     """
     axis, space, period = axis_of(words), space_of(words), words[PERIOD]
     i = segment_of(axis, anchor)
@@ -358,11 +358,11 @@ def fill_table(
     """Multiply sums by exp 2 pi i (phase + frequency j), j = 0 ... n - 1, and conjugate if ``sign`` is -1.
 
     Args:
-        words: Of axis and workspace, whose table is the result.
+        words: Words of axis and workspace. The workspace's table is the result.
         at: Number of the sums in the workspace.
-        n_sums: How many there are.
-        first: Where j is 0.
-        n: How many samples; there is room for CHUNK more.
+        n_sums: Number of sums.
+        first: Place where j is 0.
+        n: Number of samples. There is room for CHUNK more.
         sign: 1 or -1.
         phase: In cycles.
         frequency: In cycles per sample.
@@ -409,15 +409,15 @@ def add_group(
     """Add a group to ``n`` samples of a strip.
 
     Args:
-        words: Of axis and workspace.
-        n: How many.
+        words: Words of axis and workspace.
+        n: Number of samples.
         at: Number of its sums in the workspace.
-        offset: Where in them the first sample is.
-        phase: Phase of its wave there, in cycles.
+        offset: Place of the first sample in them.
+        phase: Phase of its wave at the first sample, in cycles.
         frequency: Frequency, in cycles per sample.
         chirp: Chirp, in cycles per sample squared.
         u: Fraction of the segment that has passed at the first sample.
-        per_sample: What is added to it from sample to sample; 0 if the group is not blended.
+        per_sample: Increase of ``u`` from sample to sample, or 0 if the group is not blended.
     """
     space, period = space_of(words), words[PERIOD]
     acc, n_sums = space.samples, 1 if per_sample == 0.0 else N_COEFFICIENTS
@@ -425,7 +425,7 @@ def add_group(
         now = turn(phase + 0.5 * frequency * n)
         add_parked(acc, n, space.sums[at, 0], space.sums[at, 1], offset, period, now, (1.0, 0.0))
         return
-    # the real part is that of the conjugate, so that a chirp serves both directions
+    # the conjugate has the same real part, so a chirp serves both directions
     sign = math.copysign(1.0, chirp)
     fill_table(words, at, n_sums, offset, min(period, n) + CHUNK, sign, phase, frequency)
     re, im, by = space.table[0], space.table[1], turn(sign * frequency * period)
@@ -441,7 +441,7 @@ def add_group(
 
 @helper_kernel(f"void({WORDS}, int64, int64, int64)")
 def fill_strip(words: Words, i: int, start: int, n: int) -> None:
-    """Fill in ``n`` samples of segment ``i`` from ``start`` on, those of steady tones after the envelope."""
+    """Fill in ``n`` samples of segment ``i`` from ``start`` on, with steady tones after the envelope."""
     axis, space = axis_of(words), space_of(words)
     waves, acc, length = axis.waves, space.samples, axis.length[i]
     x, slope = start + axis.delta[i], (axis.squares[1, i] - axis.squares[0, i]) / length
@@ -462,7 +462,7 @@ def fill_strip(words: Words, i: int, start: int, n: int) -> None:
 
 @helper_kernel(f"boolean({WORDS}, int64)")
 def has_period(words: Words, i: int) -> bool:
-    """Whether all blocks of a segment are equal: steady tones on the comb are parked, with whole cycles."""
+    """True if all blocks of a segment are equal (steady tones parked on the comb, in whole cycles)."""
     axis, block = axis_of(words), words[BLOCK]
     waves = axis.waves
     for k in range(axis.offsets[i], axis.offsets[i + 1]):
@@ -480,8 +480,8 @@ def has_period(words: Words, i: int) -> bool:
 def render_comb(words: Words, i: int, skip: int, out: NDArray[np.int16]) -> None:
     """Render a part of segment ``i``, on the comb or blended, from sample ``skip`` of the segment on.
 
-    It is worked out strip by strip, each from its start, so that a sample does not depend
-    on the stretch.
+    It is computed strip by strip, each from its start, so that a sample does not depend on which part is
+    rendered.
     """
     axis, space, number, block = axis_of(words), space_of(words), words[NUMBER], words[BLOCK]
     n_samples = axis.first[i + 1] - axis.first[i]
@@ -494,6 +494,6 @@ def render_comb(words: Words, i: int, skip: int, out: NDArray[np.int16]) -> None
         return
     for s in range(skip // STRIP, (skip + len(out) - 1) // STRIP + 1):
         start, end = max(0, skip - s * STRIP), min(STRIP, skip + len(out) - s * STRIP)
-        if not is_there(space.strip, number, i, s):  # a stretch that follows needs the rest
+        if not is_there(space.strip, number, i, s):  # the part that follows needs the rest
             fill_strip(words, i, s * STRIP, min(STRIP, n_samples - s * STRIP))
         store(out[s * STRIP + start - skip :], end - start, space.samples, start)

@@ -1,8 +1,8 @@
 """Kernels that sum tone by tone, for any frequency course.
 
-Frequencies are in cycles per sample, times in samples, phases in cycles. The phase is
-worked out in float64 every :data:`LANES` samples, with its first and second derivative;
-between them in integers of 2^-32 cycles, where whole cycles drop out by themselves.
+Frequencies are in cycles per sample, times in samples, phases in cycles. The phase is computed in float64
+every :data:`LANES` samples, with its first and second derivative. Between these it is computed in integers of
+2^-32 cycles, where whole cycles drop out by themselves.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ BEND_BITS: Final = 8
 """Extra bits of the second derivative of the phase."""
 
 MAX_CHIRP: Final = 2.0**-17
-"""Chirp above which a tone is steep, in cycles per sample squared; see :func:`add_steep`."""
+"""Chirp above which :func:`add_steep` adds a tone, in cycles per sample squared."""
 
 MAX_JERK: Final = 5e-11
-"""Change of the chirp above which a tone is steep, in cycles per sample cubed: an error of 1e-8 cycles."""
+"""Change of chirp above which a tone is steep, in cycles per sample cubed, for an error of 1e-8 cycles."""
 
 QUARTER: Final = np.int32(1 << 30)
 PER_UNIT: Final = np.float32(2.0**-32)
-# sin(2 pi z) for |z| <= 1/4, fitted one coefficient after the other, each rounded first; error below 8e-9
+# sin(2 pi z) for |z| <= 1/4, fitted one coefficient after the other, each rounded first, error below 8e-9
 C1: Final = np.float32(6.2831855)
 C3: Final = np.float32(-41.341713)
 C5: Final = np.float32(81.60403)
@@ -94,10 +94,10 @@ def constant_jerk(u: float) -> tuple[float, float, float, float]:
 
 @kernel("UniTuple(float64, 4)(int64, float64)")
 def course(kind: int, u: float) -> tuple[float, float, float, float]:
-    """Part of its change that a frequency has completed at a fraction ``u`` of the segment.
+    """Fraction of its change that a frequency has completed at a fraction ``u`` of the segment.
 
     Returns:
-        Integral of that from 0 to u; itself, from 0 to 1; its first and second derivative.
+        Integral of this fraction from 0 to u, the fraction, from 0 to 1, and its first and second derivative.
     """
     if kind == MINIMUM_JERK:
         return minimum_jerk(u)
@@ -108,7 +108,7 @@ def course(kind: int, u: float) -> tuple[float, float, float, float]:
 
 @helper_kernel("boolean(int64, float64, float64)")
 def is_steep(kind: int, sweep: float, length: float) -> bool:
-    """Whether the frequency of a tone changes too fast for :func:`add_tone`: by ``sweep`` in the segment."""
+    """True if a tone's frequency, which changes by ``sweep``, changes too fast for :func:`add_tone`."""
     chirp = abs(sweep) / length
     if kind == LINEAR:
         return chirp > MAX_CHIRP
@@ -181,9 +181,9 @@ def fill_nodes(
 ) -> None:
     """Compute phase, frequency and chirp of a tone in the middle of every LANES samples, from ``x`` on.
 
-    The third derivative is made part of the frequency such that its error is least.
-    ``phase`` and ``frequency`` are those at the start of the segment, ``sweep`` is the change of the
-    frequency. The result is int32 (3, >= n), in 2^-32 cycles; the chirp halved and finer by BEND_BITS.
+    The third derivative is made part of the frequency such that its error is least. ``phase`` and
+    ``frequency`` are at the start of the segment, ``sweep`` is the change of the frequency. The result is
+    int32 (3, >= n), in 2^-32 cycles. The chirp is halved and finer by BEND_BITS.
     """
     a, b, c = nodes[0], nodes[1], nodes[2]
     if kind == MINIMUM_JERK:
@@ -196,7 +196,7 @@ def fill_nodes(
 
 @helper_kernel("float32(int32, int32, int32, int64)", fused=True)
 def wave(phase: int, frequency: int, bend: int, r: int) -> float:
-    """Cosine of a phase, ``r`` samples from its node; cos(2 pi t) = sin(2 pi (1/4 - |t|))."""
+    """Cosine of a phase, ``r`` samples from its node, by cos(2 pi t) = sin(2 pi (1/4 - |t|))."""
     near = np.int32(r)
     t = np.int32(phase + frequency * near)
     t = np.int32(t + (np.int32(bend * np.int32(near * near)) >> BEND_BITS))
@@ -243,8 +243,8 @@ def add_steep(
 ) -> None:
     """Add a tone of any steepness to ``n`` samples, all in float64.
 
-    ``start`` and ``slope`` are its squared amplitude at the first sample and what it changes
-    by from sample to sample; the others as in :func:`fill_nodes`.
+    ``start`` and ``slope`` are its squared amplitude at the first sample and the change from sample to
+    sample. The other arguments are as in :func:`fill_nodes`.
     """
     for j in range(n):
         at = x + j
@@ -278,7 +278,7 @@ def add_direct(words: Words, i: int, k: int, x: float, n: int, shared: bool) -> 
 
 @helper_kernel(f"void({WORDS}, int64, int64, int16[::1])")
 def render_direct(words: Words, i: int, skip: int, out: NDArray[np.int16]) -> None:
-    """Render a part of segment ``i`` tone by tone; see :func:`render_comb`."""
+    """Render a part of segment ``i`` tone by tone, with arguments as in :func:`render_comb`."""
     axis, space = axis_of(words), space_of(words)
     tones, offsets, samples = axis.tones, axis.offsets, space.samples
     shared, first, last = envelope(tones, offsets[i], offsets[i + 1])
@@ -300,10 +300,10 @@ def render_direct(words: Words, i: int, skip: int, out: NDArray[np.int16]) -> No
 
 @kernel("int64(int64, int64, int64)")
 def render_at(address: int, start: int, out_address: int) -> int:
-    """Render samples of an axis; beyond its end they are 0.
+    """Render samples of an axis, with 0 beyond its end.
 
     Args:
-        address: Of the words of the axis and of a workspace, of which N_OUT is the number of samples.
+        address: Address of the words of the axis and of a workspace. Word N_OUT is the number of samples.
         start: First sample.
         out_address: Address of the result, int16 (N_OUT,).
 

@@ -1,4 +1,4 @@
-"""Kernels that find the tones of a segment that share a chirp, and those that stay together in the next one.
+"""Kernels that group the tones of a segment that share a chirp, and find groups that stay in the next.
 
 For the tones of an axis, and their units, see :mod:`labseq.motion.render_kernels`.
 """
@@ -48,16 +48,16 @@ Bytes = NDArray[np.int8]
 Floats = NDArray[np.float64]
 
 NEAR_TOOTH: Final = 0.05
-"""Phase beyond which no cubic follows a tone, in cycles."""
+"""Phase beyond which no cubic can follow a tone, in cycles."""
 
 BLENDING: Final = 1e-7
-"""Allowed error of all cubics together, as a fraction of full scale: 0.003 of the last digit."""
+"""Allowed error of all cubics together, as a fraction of full scale (0.003 of the last digit)."""
 
 BLENDED_COST: Final = 4
-"""A blended group takes as long to render as so many tones one by one, at a period of 390 samples."""
+"""A blended group takes as long to render as this many single tones, at a period of 390 samples."""
 
 NODES: Final = 0.5 - 0.5 * np.cos(np.pi * (np.arange(N_COEFFICIENTS) + 0.5) / N_COEFFICIENTS)
-"""Points of a segment at which a cubic equals the function that it approximates: Chebyshev nodes."""
+"""Chebyshev nodes, where a cubic equals the function that it approximates, as fractions of a segment."""
 
 TO_CUBIC: Final = np.linalg.inv(np.vander(NODES, increasing=True))
 EXTREMES: Final = 0.5 - 0.5 * np.cos(np.pi * np.arange(N_COEFFICIENTS + 1) / N_COEFFICIENTS)
@@ -66,17 +66,17 @@ EXTREMES: Final = 0.5 - 0.5 * np.cos(np.pi * np.arange(N_COEFFICIENTS + 1) / N_C
 
 @helper_kernel(f"boolean({TONES}, int64)")
 def is_steady(tones: Floats, k: int) -> bool:
-    """Whether the amplitude of a tone stays the same."""
+    """True if the amplitude of a tone stays the same."""
     a, b = tones[START_AMPLITUDE, k], tones[END_AMPLITUDE, k]
     return abs(a - b) <= 1e-9 * max(a, b)
 
 
 @helper_kernel(f"Tuple((boolean, float64, float64))({TONES}, int64, int64)")
 def envelope(tones: Floats, start: int, stop: int) -> tuple[bool, float, float]:
-    """Find the common course of the squared amplitudes of those of a segment's tones that are not steady.
+    """Find the common course of the squared amplitudes of a segment's unsteady tones.
 
     Returns:
-        Whether they share one; its value at the start and at the end, the larger being 1.
+        True if they share a course, and its values at the start and at the end. The larger is 1.
     """
     first = last = largest = 0.0
     for k in range(start, stop):
@@ -96,8 +96,8 @@ def envelope(tones: Floats, start: int, stop: int) -> tuple[bool, float, float]:
 def slow_part(u: float, a: float, b: float, drift: float, bend: float) -> tuple[float, float]:
     """Amplitude and phase of a tone relative to its tooth at a fraction ``u`` of the segment.
 
-    The amplitude goes from ``a`` to ``b``; ``drift`` and ``bend`` are the cycles by which the tone
-    leaves the tooth in the segment, by its first frequency and by its chirp.
+    The amplitude goes from ``a`` to ``b``. In the segment the tone leaves the tooth by ``drift`` cycles due
+    to its first frequency, and by ``bend`` cycles due to its chirp.
     """
     amplitude = math.sqrt(max(0.0, a * a + (b * b - a * a) * u))
     re, im = turn(drift * u + bend * u * u)
@@ -106,7 +106,7 @@ def slow_part(u: float, a: float, b: float, drift: float, bend: float) -> tuple[
 
 @helper_kernel(f"float64(float64, float64, float64, float64, {F64}, {F64})")
 def fit_cubic(a: float, b: float, drift: float, bend: float, re: Floats, im: Floats) -> float:
-    """Fit a cubic in u to :func:`slow_part`, coefficients float64 (4,) by power; return its largest error."""
+    """Fit a cubic in u to :func:`slow_part`, with 4 coefficients by power, and return its largest error."""
     re[:], im[:] = 0.0, 0.0
     for n in range(N_COEFFICIENTS):
         x, y = slow_part(NODES[n], a, b, drift, bend)
@@ -127,7 +127,7 @@ def fit_cubic(a: float, b: float, drift: float, bend: float, re: Floats, im: Flo
 def off_tooth(
     tones: Floats, k: int, anchor: int, n_teeth: int, step: float, length: float
 ) -> tuple[float, float]:
-    """Phase by which tone ``k`` leaves its tooth of the group's comb, in cycles: by frequency, by chirp.
+    """Phases by which tone ``k`` leaves its tooth of the group's comb through frequency and chirp, in cycles.
 
     ``anchor`` is the group's first tone, which defines its frequency and chirp, ``n_teeth`` teeth below. The
     spacing of the teeth, ``step``, is in cycles per sample, the ``length`` of the segment in samples.
@@ -141,12 +141,12 @@ def off_tooth(
 def find_groups(words: Words, i: int, shared: bool, near: float, anchors: NDArray[np.int64]) -> int:
     """Give each tone of segment ``i`` its tooth, and a group of tones that share its chirp.
 
-    Each group is on a comb of its own: only its spacing is that of the axis. Tones may leave their teeth by
-    ``near`` cycles. Where ``shared``, see :func:`envelope`, tones that are steady have groups of their own.
-    The first tone of each goes into ``anchors``, int64 (MAX_GROUPS,).
+    Each group has a comb of its own, with the spacing of the axis. Tones may leave their teeth by ``near``
+    cycles. If the other tones share an :func:`envelope` (``shared``), steady tones have groups of their own.
+    The first tone of each group goes into ``anchors``, int64 (MAX_GROUPS,).
 
     Returns:
-        The number of groups; 0 if a tone has none.
+        The number of groups, or 0 if a tone has none.
     """
     axis, step = axis_of(words), words.view(np.float64)[STEP]
     tones, tooth, first, n_groups = axis.tones, axis.tooth, words[FIRST_TOOTH], 0
@@ -176,7 +176,7 @@ def find_groups(words: Words, i: int, shared: bool, near: float, anchors: NDArra
 
 @helper_kernel(f"boolean({WORDS}, int64, boolean, int64[::1])")
 def can_blend(words: Words, i: int, shared: bool, anchors: NDArray[np.int64]) -> bool:
-    """Whether cubics follow the tones of a segment, which all have a group, well enough."""
+    """True if cubics follow the tones of a segment, which all have a group, well enough."""
     axis, step, error = axis_of(words), words.view(np.float64)[STEP], 0.0
     tones, re, im = axis.tones, np.empty(N_COEFFICIENTS), np.empty(N_COEFFICIENTS)
     for k in range(axis.offsets[i], axis.offsets[i + 1]):
@@ -214,7 +214,7 @@ def choose(words: Words, i: int, shared: bool) -> int:
 
 @helper_kernel()
 def next_of_group(group: Bytes, g: int, start: int, stop: int) -> int:
-    """The first tone of a group from ``start`` on; ``stop`` if there is none."""
+    """The first tone of a group from ``start`` on, or ``stop``."""
     k = start
     while k < stop and group[k] != g:
         k += 1
@@ -229,10 +229,11 @@ def segment_of(axis: Axis, k: int) -> int:
 
 @helper_kernel(f"Tuple((int64, float64))({WORDS}, int64, int64)")
 def since_tone(words: Words, i: int, m: int) -> tuple[int, float]:
-    """Samples from the first one of the segment of tone ``m`` to that of segment ``i``, less whole periods.
+    """Samples from the start of the segment of tone ``m`` to the start of segment ``i``, less whole periods.
 
     Returns:
-        These, and the cycles by which each tooth turns more than the one below from segment to segment.
+        These samples, and the cycles by which each tooth turns more than the tooth below from segment to
+        segment.
     """
     axis = axis_of(words)
     before = segment_of(axis, m)
@@ -242,7 +243,7 @@ def since_tone(words: Words, i: int, m: int) -> tuple[int, float]:
 
 @helper_kernel(f"boolean({WORDS}, int64, int64, int64)")
 def has_same_sums(words: Words, i: int, k: int, m: int) -> bool:
-    """Whether a group of segment ``i`` has the sums of an earlier one, times a wave.
+    """True if a group of segment ``i`` has the sums of an earlier group, times a wave.
 
     Their first tones are ``k`` and ``m``.
     """
@@ -266,7 +267,7 @@ def has_same_sums(words: Words, i: int, k: int, m: int) -> bool:
 
 @helper_kernel(f"void({WORDS}, int64, int64)")
 def fill_wave(words: Words, i: int, k: int) -> None:
-    """Fill in what multiplies the sums of the group whose first tone is ``k``, and take over their teeth."""
+    """Fill in the factor of the sums of the group whose first tone is ``k``, and take over their teeth."""
     axis = axis_of(words)
     m = axis.origin[k]
     tones, tooth, waves, (since, per_tooth) = axis.tones, axis.tooth, axis.waves, since_tone(words, i, m)
@@ -282,10 +283,10 @@ def fill_wave(words: Words, i: int, k: int) -> None:
 
 @helper_kernel(f"void({WORDS}, int64, int64[::1])")
 def find_origins(words: Words, i: int, latest: NDArray[np.int64]) -> None:
-    """Find the groups of segment ``i`` that stay together from the one before on; they keep its sums.
+    """Find the groups of segment ``i`` that stay together from the segment before, and keep its sums.
 
-    ``latest``, int64 (MAX_GROUPS,), is the first tone of each group of the segment before in the segment
-    where its sums were first needed, -1: none; updated to those of this one.
+    ``latest``, int64 (MAX_GROUPS,), is the first tone of each group of the segment before, in the segment
+    where its sums were first needed, or -1. It is updated for segment ``i``.
     """
     axis, before = axis_of(words), latest.copy()
     latest[:] = -1
@@ -304,7 +305,7 @@ def find_origins(words: Words, i: int, latest: NDArray[np.int64]) -> None:
 
 @kernel(f"void({WORDS})")
 def choose_paths(words: Words) -> None:
-    """Decide how each segment of an axis is rendered: fill in all arrays from the path on."""
+    """Decide how each segment of an axis is rendered, and fill in all arrays from the path on."""
     axis, latest = axis_of(words), np.full(MAX_GROUPS, -1)
     for i in range(words[N_SEGMENTS]):
         start, stop = axis.offsets[i], axis.offsets[i + 1]

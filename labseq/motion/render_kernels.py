@@ -1,8 +1,8 @@
-"""What the kernels of rendering share: the arrays of axes and workspaces, envelopes, rounding and storing.
+"""Shared parts of the rendering kernels, with arrays of axes and workspaces, envelopes, rounding and storing.
 
-The tones of an axis are rows of a float64 array, as in :mod:`labseq.motion.tone_kernels`:
-frequency at the start and at the end of the segment, amplitude at the start and at the
-end, and phase at the start, here in cycles per sample, fractions of full scale and cycles.
+The tones of an axis are rows of a float64 array as in :mod:`labseq.motion.tone_kernels`, with frequency at
+the start and at the end of the segment, amplitude at the start and at the end, and phase at the start. Their
+units here are cycles per sample, fractions of full scale and cycles.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ LANES: Final = 32
 """Samples computed together."""
 
 CHUNK: Final = 128
-"""The same for tones on a comb."""
+"""Samples computed together for tones on a comb."""
 
 STRIP: Final = 8192
-"""Most samples worked out one after the other: they and what they are made of fit into the fast caches."""
+"""Most samples computed in a row, so that they and their tables fit into the fast caches."""
 
 N_CHIRPS: Final = 32
-"""Number of cached chirps: lanes that weave need up to 20 on an axis."""
+"""Number of cached chirps. Lanes that weave need up to 20 on an axis."""
 
 N_KEPT: Final = 8
-"""Number of sums kept in a workspace: twice the groups of a segment."""
+"""Number of sums kept in a workspace, which is twice the groups of a segment."""
 
 F32: Final = "float32[::1]"
 F64: Final = "float64[::1]"
@@ -61,17 +61,17 @@ BLENDED: Final = 2
 DIRECT: Final = 3
 
 MAX_GROUPS: Final = 4
-"""Tones that move left, that move right, and that are parked, on lines and between them."""
+"""Groups of tones that move left, move right, are parked on lines, and are parked between lines."""
 
 ON_TOOTH: Final = 2e-9
-"""Phase by which a tone may leave its tooth in a segment, in cycles: 0.0004 digits at full scale."""
+"""Phase by which a tone may leave its tooth in a segment, in cycles (0.0004 digits at full scale)."""
 
 N_COEFFICIENTS: Final = 4
 
-PHASE_SINCE: Final = 0  # of a group's wave: phase, by which its sums are turned in its segment
-FREQUENCY: Final = 1  # at the start of the segment, less that of its tooth
+PHASE_SINCE: Final = 0  # of a group's wave, the phase by which its sums are turned in its segment
+FREQUENCY: Final = 1  # at the start of the segment, less the frequency of its tooth
 CHIRP: Final = 2
-SINCE: Final = 3  # samples since the first one of the sums, less whole periods
+SINCE: Final = 3  # samples since the first sample of the sums, less whole periods
 STEADY: Final = 4  # 1 if the amplitude stays the same
 N_WAVE: Final = 5
 
@@ -83,10 +83,10 @@ Samples = NDArray[np.int16]
 FULL_SCALE: Final = 32767.0
 
 N_ROWS: Final = 2 * N_COEFFICIENTS
-"""Rows of a table: real and imaginary part of the coefficient of each power of the time."""
+"""Rows of a table, which are real and imaginary part of the coefficient of each power of the time."""
 
-# Kernels get words, int64: to pass twenty arrays to each takes as long as to render 1000 samples.
-N_OUT: Final = 0  # how many samples to render
+# Kernels get int64 words, because passing twenty arrays to each takes as long as rendering 1000 samples.
+N_OUT: Final = 0  # number of samples to render
 N_TONES: Final = 1
 N_SEGMENTS: Final = 2
 PERIOD: Final = 3  # of the teeth
@@ -94,7 +94,7 @@ N_TEETH: Final = 4
 FIRST_TOOTH: Final = 5
 STEP: Final = 6  # spacing of the teeth in cycles per sample, a float64
 BLOCK: Final = 7  # samples of a block
-NUMBER: Final = 8  # that no other axis has
+NUMBER: Final = 8  # unique to the axis
 AXIS_AT: Final = 9  # addresses of the arrays of an Axis
 Words = NDArray[np.int64]
 WORDS: Final = "int64[::1]"
@@ -108,15 +108,15 @@ class Axis(NamedTuple):
         offsets: int32 (n_segments + 1,), where each segment's tones start.
         course: int8 (n_segments,), of the frequencies.
         first: int64 (n_segments + 1,), first sample of each segment, and the end of the last.
-        delta: float64 (n_segments,), the time from its start to there, in samples.
-        length: float64 (n_segments,), its length, in samples.
+        delta: float64 (n_segments,), time from the segment's start to its first sample, in samples.
+        length: float64 (n_segments,), length of the segment, in samples.
         teeth: float64 (2 n_teeth, period), cosine and sine of each tooth.
         path: int8 (n_segments,), see :class:`labseq.motion.RenderPath`.
-        squares: float64 (2, n_segments), squared amplitude of tones that are not steady at its start and end.
+        squares: float64 (2, n_segments), squared amplitude of unsteady tones at its start and end.
         group: int8 (n_tones,), the group of each tone in its segment.
-        origin: int32 (n_tones,), for the first tone of a group the one of the first group of the same sums,
-            else -1.
-        waves: float64 (N_WAVE, n_tones), for the first tone of a group what multiplies these sums.
+        origin: int32 (n_tones,), for the first tone of a group the first tone of the first group with the
+            same sums, else -1.
+        waves: float64 (N_WAVE, n_tones), for the first tone of a group the factor of these sums.
         tooth: int32 (n_tones,), tooth of each tone, as in the group of its origin.
     """
 
@@ -167,14 +167,14 @@ class Space(NamedTuple):
         sums: float32 (N_KEPT, N_ROWS, width), over two periods, or a period and a strip.
         table: float32 (N_ROWS, width), the sums of a group in a strip times its wave.
         blended: float32 (2, width), a blended table.
-        samples: float32 (width,), those of a strip.
+        samples: float32 (width,), samples of a strip.
         wave: float32 (2, CHUNK).
-        total: float64 (N_ROWS, width), sums in the making.
+        total: float64 (N_ROWS, width), unfinished sums.
         cubic: float64 (2, N_COEFFICIENTS).
         lanes: float64 (4, CHUNK).
         chirps: float32 (N_CHIRPS, 2, STRIP + CHUNK).
         chirp_keys: float64 (N_CHIRPS + 1,), see :func:`find_chirp`.
-        sum_keys: int64 (N_KEPT + 1, 3), axis, first tone, latest segment; and the next place.
+        sum_keys: int64 (N_KEPT + 1, 3), axis, first tone and latest segment, and the next place.
         strip: int64 (3,), axis, segment and strip of the samples.
         nodes: int32 (3, width / LANES), of a tone.
         repeated: int16 (width,), a block that is repeated.
@@ -222,10 +222,10 @@ def space_of(words: Words) -> Space:
 
 
 class Workspace:
-    """The workspace of one thread, for blocks of some samples.
+    """The workspace of one thread, for blocks of a given size.
 
     Attributes:
-        words: int64 (N_WORDS - WIDTH,), for kernels: its width, and the addresses of its arrays.
+        words: int64 (N_WORDS - WIDTH,), for kernels, with its width and the addresses of its arrays.
     """
 
     def __init__(self, block: int) -> None:
@@ -255,7 +255,7 @@ class Workspace:
 
 
 def _aligned(shape: tuple[int, ...], dtype: type[np.floating]) -> NDArray[Any]:
-    """Zeros that start where a vector of the processor may: elsewhere rendering takes half as long again."""
+    """Zeros aligned for vector instructions. Without alignment rendering takes half as long again."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     memory = np.zeros(size + 64, np.uint8)
     first = -memory.ctypes.data % 64
@@ -264,7 +264,7 @@ def _aligned(shape: tuple[int, ...], dtype: type[np.floating]) -> NDArray[Any]:
 
 @helper_kernel(f"boolean({WORDS}, int64, int64, int64)")
 def is_there(key: Words, number: int, i: int, strip: int) -> bool:
-    """Whether samples are those of a strip of segment ``i`` of an axis; from now on they are."""
+    """True if the samples already belong to a strip of segment ``i`` of an axis. From now on they do."""
     if key[0] == number and key[1] == i and key[2] == strip:
         return True
     key[0], key[1], key[2] = number, i, strip
@@ -273,7 +273,7 @@ def is_there(key: Words, number: int, i: int, strip: int) -> bool:
 
 @helper_kernel("void(int16[::1], int64, float32[::1], int64)")
 def store(out: NDArray[np.int16], n: int, values: Singles, skip: int) -> None:
-    """Round ``values[skip:skip + n]`` to integers, through int32, which is four times faster."""
+    """Round ``values[skip:skip + n]`` to integers through int32, which is four times faster."""
     most, kept = np.int32(FULL_SCALE), values[skip:]
     for j in range(n):
         out[j] = np.int16(min(max(np.int32(np.rint(kept[j])), -most), most))
@@ -297,14 +297,14 @@ def repeat(out: NDArray[np.int16], skip: int, block: NDArray[np.int16], n: int) 
 def apply_envelope(values: Singles, n: int, start: float, slope: float) -> None:
     """Multiply ``n`` samples by an amplitude whose square changes linearly from sample to sample.
 
-    Where it changes by less than a sixteenth from the middle of some samples on, that is by four terms of a
-    series, whose error is below 3e-8: square roots take much longer.
+    Where it changes by less than a sixteenth around the middle of some samples, a series of four terms with
+    an error below 3e-8 is used, because square roots take much longer.
 
     Args:
-        values: float32 (>= n + CHUNK,); updated.
-        n: How many.
-        start: The squared amplitude at the first sample; below 0 counts as 0.
-        slope: Its change from each to the next.
+        values: float32 (>= n + CHUNK,). Updated.
+        n: Number of samples.
+        start: The squared amplitude at the first sample. Below 0 counts as 0.
+        slope: Its change from each sample to the next.
     """
     middle = 0.5 * (CHUNK - 1)
     for q in range((n + CHUNK - 1) // CHUNK):
@@ -328,7 +328,7 @@ C_4: Final = np.float32(-5 / 128)
 
 
 SUM: Final = 5
-"""Amplitudes that add up to more than full scale; see :data:`N_FIELDS` for the other fields."""
+"""Fault of a sum of amplitudes above full scale. Other faults are numbers of fields."""
 FINE: Final = -1
 
 ROUNDING: Final = 1e-9
@@ -348,8 +348,8 @@ def place_segments(
 ) -> bool:
     """Fill in the first sample of each segment and the end, int64 (n + 1,), and its times, float64 (n,).
 
-    These are, in samples, the time from its start to its first sample, and its length. Returns whether all
-    durations are finite and not negative, and there are less than ``most_samples``.
+    The times are the time from its start to its first sample and its length, in samples. Returns True if all
+    durations are finite and not negative, and there are fewer than ``most_samples``.
     """
     start_s = 0.0
     for i in range(len(duration_s)):
@@ -382,7 +382,7 @@ def take_tones(
     """Convert the tones of an axis, as in :class:`labseq.model.AxisTones`, to the units of rendering.
 
     Returns:
-        What is wrong, a field or SUM (FINE: nothing is), and the first tone or segment where it is.
+        The wrong field, SUM, or FINE if nothing is wrong, and the first tone or segment where it is wrong.
     """
     half_hz, most = 0.5 * sample_rate_hz, 1.0 + ROUNDING
     for i in range(len(offsets) - 1):

@@ -1,6 +1,6 @@
-"""The definition of the samples of a tone program, in a few lines of numpy.
+"""Defines the samples of a tone program in a few lines of numpy.
 
-Slow; the yardstick for :func:`labseq.render`, in its tests and its benchmark.
+This is slow. Tests and benchmark compare :func:`labseq.render` with it.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ def render_reference(
         program: The tone program.
         sample_rate_hz: Sample rate.
         start: First sample.
-        stop: The sample after the last; by default the end of the program.
+        stop: The sample after the last. By default the end of the program.
 
     Returns:
-        float64 (2, stop - start), 32767 at full scale; channel 0 plays the row tones.
+        float64 (2, stop - start), 32767 at full scale. Channel 0 plays the row tones.
     """
     starts = np.concatenate([[0.0], np.cumsum(program.duration_s)]) * sample_rate_hz
     first = np.rint(starts).astype(np.int64)

@@ -1,11 +1,11 @@
-"""Rendering: the samples of a tone program.
+"""Renders the samples of a tone program.
 
-A :class:`Renderer` checks a program, and its kernels do the work:
+A :class:`Renderer` checks a program. Its kernels do the work:
 
 - ``comb_kernels`` find the spacing of the tones of an axis;
 - ``render_group_kernels`` choose how each segment is rendered, and which of its tones share a chirp;
-- ``render_comb_kernels`` render such groups, ``render_direct_kernels`` anything else, tone by tone;
-- ``render_kernels`` is what these share: the arrays of an axis and of a workspace, envelopes, rounding.
+- ``render_comb_kernels`` render these groups; ``render_direct_kernels`` render everything else, tone by tone;
+- ``render_kernels`` hold the shared parts, which are arrays of axes and workspaces, envelopes and rounding.
 
 ``render_reference`` defines the samples in plain numpy, for tests.
 """
@@ -36,17 +36,17 @@ if TYPE_CHECKING:
 
 
 MIN_BLOCK: Final = 1536
-"""Smallest size of a block, in samples: in four periods of 390 tones half-way between sites repeat, too."""
+"""Smallest size of a block, in samples. Tones half-way between sites repeat after four periods of 390."""
 
 TEETH: Final = 8
-"""Tables of teeth are made for so many at a time, so that the next program finds those of the one before."""
+"""Number of teeth whose tables are made at a time, so that the next program can reuse them."""
 
 MIN_PERIOD: Final = 128
 """Shortest period of a table, in samples."""
 
 MIN_REUSED: Final = 1 << 19
 MAX_REUSED: Final = 1 << 26
-"""Samples of both channels, of waveforms whose memory :func:`render` uses again: 1 to 128 MB."""
+"""Fewest and most samples of both channels, in waveforms whose memory :func:`render` reuses (1 to 128 MB)."""
 
 _NUMBERS: Final = count()
 
@@ -59,10 +59,10 @@ class Comb:
     """The comb of an axis at a sample rate.
 
     Attributes:
-        first: Number of the first tooth; tooth 0 is 0 Hz.
-        step: Spacing of the teeth, in cycles per sample; ``step * period`` is whole.
-        teeth: float64 (2 n_teeth, period), cosine and sine of each tooth; of no length if there is no comb.
-        block: Samples after which parked tones may repeat themselves, a multiple of the period.
+        first: Number of the first tooth. Tooth 0 is 0 Hz.
+        step: Spacing of the teeth, in cycles per sample. ``step * period`` is whole.
+        teeth: float64 (2 n_teeth, period), cosine and sine of each tooth. Empty without a comb.
+        block: Samples after which parked tones may repeat, a multiple of the period.
     """
 
     first: int
@@ -91,7 +91,7 @@ def comb_sample_rate(
         grid: Its row and column frequencies, equally spaced on each axis.
         max_hz: Fastest sample rate allowed.
         min_hz: Slowest sample rate allowed.
-        clock_step_hz: Sample rates of the AWG are multiples of this; 8 Hz for the Spectrum M4i.66xx.
+        clock_step_hz: Sample rates of the AWG are multiples of this. It is 8 Hz for the Spectrum M4i.66xx.
 
     Returns:
         The rate in Hz, a whole number of clock steps. If the spacing is not a round number
@@ -127,9 +127,9 @@ def find_comb(spacing: float, lowest_hz: float, span_hz: float, sample_rate_hz: 
     """The comb that contains most tones of an axis, if one matches the sample rate.
 
     Args:
-        spacing: The one that most gaps between the tones are multiples of, in Hz; see ``common_spacing``.
+        spacing: Spacing of which most gaps between the tones are multiples, in Hz. See ``common_spacing``.
         lowest_hz: Frequency of the first tone.
-        span_hz: Distance of the last one.
+        span_hz: Distance from the first tone to the last.
         sample_rate_hz: Sample rate.
     """
     from labseq.motion.comb_kernels import MAX_TEETH, TOLERANCE_HZ
@@ -137,7 +137,7 @@ def find_comb(spacing: float, lowest_hz: float, span_hz: float, sample_rate_hz: 
     if spacing < 0.0:
         return NO_COMB
     origin = lowest_hz / sample_rate_hz
-    if spacing == 0.0:  # then it may as well be on a tooth of 0 Hz's comb, and repeat itself
+    if spacing == 0.0:  # a single tone may use a tooth of the 0 Hz comb, and so repeat itself
         spacing = sample_rate_hz / _ratio(origin).denominator
     ratio = _ratio(spacing / sample_rate_hz)
     periods = math.ceil(MIN_PERIOD / ratio.denominator)
@@ -154,7 +154,7 @@ def find_comb(spacing: float, lowest_hz: float, span_hz: float, sample_rate_hz: 
 
 @lru_cache(maxsize=64)
 def _ratio(value: float) -> Fraction:
-    """The nearest fraction of small numbers; working it out takes 0.04 ms."""
+    """The nearest fraction of small numbers, which takes 0.04 ms to find."""
     return Fraction(value).limit_denominator(4096)  # tables of a comb with a longer period are not worth it
 
 
@@ -171,7 +171,7 @@ def _teeth(numerator: int, period: int, first: int, n_teeth: int) -> NDArray[np.
 
 
 def _spacing(site_hz: NDArray[np.float64]) -> float:
-    """Mean spacing of the sites' frequencies; 0 for a single site."""
+    """Mean spacing of the sites' frequencies, or 0 for a single site."""
     if len(site_hz) < 2:
         return 0.0
     return float(site_hz[-1] - site_hz[0]) / (len(site_hz) - 1)
@@ -191,8 +191,8 @@ MAX_WORKSPACES: Final = 8
 
 
 def warm_rendering() -> None:
-    """Compile the kernels of rendering, or load them from the cache; for drivers that play samples."""
-    for kernels in ("comb_kernels", "render_direct_kernels"):  # which imports the others
+    """Compile the kernels of rendering, or load them from the cache, for drivers that play samples."""
+    for kernels in ("comb_kernels", "render_direct_kernels"):  # the second imports the others
         importlib.import_module(f"labseq.motion.{kernels}")
 
 
@@ -200,15 +200,14 @@ class RenderPath(IntEnum):
     """How the tones of an axis are rendered in a segment.
 
     Attributes:
-        SILENT: There are none, or all have amplitude 0.
-        COMB: In at most four groups that share a chirp, such as left-moving, right-moving, parked, each
-            on a comb of one spacing; of parked tones some may be ramped together. The cost per sample does
-            not grow with their number.
-        BLENDED: The same, but amplitudes that change by different factors, or tones a
-            little beside their teeth, are followed by a cubic in time: four tables per
-            group are blended. Chosen if all cubics together err by less than 1e-7 of
-            full scale, and groups have more than four tones on average.
-        DIRECT: Everything else: each tone by itself.
+        SILENT: There are no tones, or all have amplitude 0.
+        COMB: At most four groups share a chirp each, such as left-moving, right-moving and parked tones. All
+            groups are on combs of one spacing. Some parked tones may be ramped together. The cost per sample
+            does not grow with the number of tones.
+        BLENDED: The same, but cubics in time follow amplitudes that change by different factors, or tones a
+            little off their teeth, by blending four tables per group. Chosen if all cubics together err by
+            less than 1e-7 of full scale, and groups have more than four tones on average.
+        DIRECT: Everything else, each tone by itself.
     """
 
     SILENT = 0
@@ -220,14 +219,13 @@ class RenderPath(IntEnum):
 class Renderer:
     """Renders any part of a tone program into the caller's buffers.
 
-    Sample n is what the program says at the time n / fs. Segment i owns the samples from
-    round(t_i fs) to round(t_(i+1) fs), where t_i is the sum of the durations before it: a
-    sample up to half a sample time outside of its segment follows the segment's own
-    formulas there. So a joint causes no error of phase wherever it falls between two
-    samples. A squared amplitude below 0 counts as 0.
+    Sample n is the value of the program at the time n / fs. Segment i owns the samples from round(t_i fs) to
+    round(t_(i+1) fs), where t_i is the sum of the durations before it. A sample up to half a sample time
+    outside its segment still follows the segment's formulas. So a joint causes no phase error wherever it
+    falls between two samples. A squared amplitude below 0 counts as 0.
 
-    Each sample is the sum of its tones, 32767 for amplitudes that add up to 1, worked
-    out to better than 0.01 and rounded to the nearest integer.
+    Each sample is the sum of its tones, 32767 for amplitudes that add up to 1, computed to better than 0.01
+    and rounded to the nearest integer.
 
     Attributes:
         sample_rate_hz: Sample rate fs, in Hz.
@@ -241,7 +239,7 @@ class Renderer:
 
         Args:
             program: The tone program.
-            sample_rate_hz: Sample rate; fastest at :func:`comb_sample_rate`.
+            sample_rate_hz: Sample rate. Rendering is fastest at :func:`comb_sample_rate`.
 
         Raises:
             LimitError: A value is not finite, a duration or an amplitude is negative, a
@@ -267,7 +265,7 @@ class Renderer:
         self.path.flags.writeable = False
 
     def write(self, channel: int, start: int, out: NDArray[np.int16]) -> None:
-        """Render samples ``start`` to ``start + len(out)`` of a channel; beyond the end they are 0.
+        """Render samples ``start`` to ``start + len(out)`` of a channel, with 0 beyond the end.
 
         Holds no lock of Python, and any number of threads can render at the same time.
         The samples do not depend on where a stretch starts.
@@ -295,8 +293,8 @@ class Renderer:
         """The program for a kernel that calls the function at :func:`render_address`, int64 (2, N_WORDS).
 
         Args:
-            workspaces: Those of the thread that renders, by channel and size of block; the kernel uses them,
-                and what is missing is added. They and the renderer must live as long as the kernel renders.
+            workspaces: Workspaces of the rendering thread, by channel and size of block. Missing ones are
+                added. They and the renderer must live as long as the kernel renders.
         """
         from labseq.motion.render_kernels import BLOCK, Workspace
 
@@ -312,8 +310,8 @@ class Renderer:
 def render_address() -> int:
     """Address of a C function that renders a part of an axis, with three arguments, all int64.
 
-    The address of a row of :meth:`Renderer.words`, whose first word is the number of samples, the first
-    sample, and where to write them, as int16. It takes no lock of Python.
+    The arguments are the address of a row of :meth:`Renderer.words`, whose first word is the number of
+    samples, then the first sample, and the address of the int16 result. It takes no lock of Python.
     """
     from labseq.motion.render_direct_kernels import render_for_c
 
@@ -322,25 +320,25 @@ def render_address() -> int:
 
 @lru_cache(maxsize=4)
 def _free_workspaces(block: int) -> deque[Workspace]:  # noqa: ARG001 - the key of the cache
-    """Unused workspaces for blocks of ``block`` samples; new memory would cost a millisecond."""
+    """Unused workspaces for blocks of ``block`` samples. New memory would cost a millisecond."""
     return deque(maxlen=MAX_WORKSPACES)
 
 
 def render(program: ToneProgram, sample_rate_hz: float = 625e6) -> Waveform:
-    """Render a whole tone program; see :class:`labseq.motion.Renderer` for what a sample is.
+    """Render a whole tone program to samples as :class:`labseq.motion.Renderer` defines them.
 
-    Memory of up to two waveforms that are no longer used is kept for the next ones, up to 128 MB each:
-    with new memory, rendering takes up to twice as long.
+    Memory of up to two unused waveforms is kept for the next ones, up to 128 MB each, because rendering into
+    new memory takes up to twice as long.
 
     Args:
         program: The tone program.
-        sample_rate_hz: Sample rate; fastest at :func:`labseq.motion.comb_sample_rate`.
+        sample_rate_hz: Sample rate. Rendering is fastest at :func:`labseq.motion.comb_sample_rate`.
 
     Returns:
-        int16 (2, n): channel 0 plays the row tones, channel 1 the column tones.
+        int16 (2, n). Channel 0 plays the row tones, channel 1 the column tones.
 
     Raises:
-        LimitError: The program is not playable: see :class:`labseq.motion.Renderer`.
+        LimitError: The program is not playable. See :class:`labseq.motion.Renderer`.
 
     Example:
         >>> from labseq import Plan, tone_program
@@ -360,7 +358,7 @@ def render(program: ToneProgram, sample_rate_hz: float = 625e6) -> Waveform:
 
 
 def _new_samples(size: int) -> NDArray[np.int16]:
-    """int16 (size,), in memory that no waveform uses any longer if there is some."""
+    """int16 (size,), in memory that no waveform uses any longer if possible."""
     if not MIN_REUSED <= size <= MAX_REUSED:
         return np.empty(size, np.int16)
     try:
@@ -390,7 +388,7 @@ def _prepare(
     """Convert an axis to the kernels' units, and choose how each segment is rendered.
 
     Returns:
-        int64 (WIDTH,), words as in :mod:`labseq.motion.render_kernels`, and what is at the addresses in it.
+        int64 (WIDTH,), words as in :mod:`labseq.motion.render_kernels`, and the arrays at its addresses.
 
     Raises:
         LimitError: See :class:`Renderer`.

@@ -1,4 +1,4 @@
-"""What a plan is expected to cost: atoms lost, and the chance of an array without defects."""
+"""Predicts how many atoms a plan loses, and the probability of an array without defects."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from labseq.motion.check import check_plan
 Floats = NDArray[np.float64]
 
 NODES: Final = 24
-"""Points of the Gauss-Hermite rule over the spread of the losses; 48 change no probability by 1e-6."""
+"""Points of the Gauss-Hermite rule over the spread of the losses. 48 change no probability by 1e-6."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +38,10 @@ class Survival:
         p_defect_free: Probability that every target site holds an atom on the next image.
         n_defects: Expected number of target sites without an atom on it.
         n_lost: Expected number of atoms lost until then, over the whole grid.
-        n_lost_moved: Those of them lost by moves.
-        n_lost_landing: Those lost because an empty tweezer was ramped down on them.
-        n_lost_passing: Those lost because a tweezer passed them, or because it took such an atom along.
+        n_lost_moved: Atoms of these lost by moves.
+        n_lost_landing: Atoms of these lost because an empty tweezer was ramped down on them.
+        n_lost_passing: Atoms of these lost because a tweezer passed them, or because it took such an atom
+            along.
         n_landings: Empty tweezers that are ramped down on an atom.
         n_passes: How often a tweezer passes a standing atom in a lane.
     """
@@ -67,20 +68,20 @@ def predict_survival(
     """Predict what a checked plan costs, by the losses of the profile.
 
     Each loss p counts as the hazard -ln(1 - p), and an atom with the sum of hazards h survives with
-    exp(-f h). The factor f is common to all atoms of a shot: log-normal with mean 1 and the spread of the
-    losses; the probability is the mean over it. Vacuum and image act on all atoms, without f.
+    probability exp(-f h). The factor f is common to all atoms of a shot. It is log-normal with mean 1 and the
+    spread of the losses, and the prediction averages over it. Vacuum and image act on all atoms, without f.
 
     Args:
         plan: The plan.
-        report: What the check says of it.
+        report: The report of its check.
         occupancy: bool (n_rows, n_cols), before the plan.
         target: The target.
         grid: The grid of sites.
         motion: How the tweezers move, with the losses.
-        wait_s: Time in vacuum beside the plan's duration.
+        wait_s: Time in vacuum in addition to the plan's duration.
 
     Returns:
-        The prediction; ``p_defect_free`` is 0 for a plan that leaves defects.
+        The prediction. ``p_defect_free`` is 0 for a plan that leaves defects.
 
     Example:
         >>> target = TargetPattern(fill=[[False, True]], clear=[[False, False]])
@@ -98,7 +99,7 @@ def predict_survival(
     factors, weights = _factors(losses.spread)
     total = hazards.sum(axis=0)
     by_cause = [_n_lost(cause[report.predicted], factors, weights) for cause in hazards]
-    lost_by_moves = max(by_cause)  # all of it, if there is one cause: the same sum need not be made twice
+    lost_by_moves = max(by_cause)  # with one cause this is the whole sum, which need not be made twice
     if np.count_nonzero(by_cause) > 1:
         lost_by_moves = _n_lost(total[report.predicted], factors, weights)
     n_atoms = np.count_nonzero(report.predicted)
@@ -118,7 +119,7 @@ def predict_survival(
 
 def _n_lost(hazards: Floats, factors: Floats, weights: Floats) -> float:
     """Expected number of atoms lost by hazards, mean over the factors."""
-    hazards = hazards[hazards > 0.0]  # those of few atoms, in most plans
+    hazards = hazards[hazards > 0.0]  # in most plans only few atoms have one
     if not len(hazards):
         return 0.0
     return float(weights @ -np.expm1(-np.multiply.outer(factors, hazards)).sum(axis=1))
@@ -141,10 +142,10 @@ def choose_plan(
     grid: SiteGrid,
     motion: MotionSpec,
 ) -> Plan:
-    """Choose the plan that leaves fewest defects, then has the highest chance of a whole target.
+    """Choose the plan that leaves the fewest defects, then has the highest chance of a complete target.
 
-    Both are worked out by :func:`check_plan` and :func:`predict_survival`; of equal chances the plan
-    counts that loses fewest atoms.
+    :func:`check_plan` counts the defects, and :func:`predict_survival` gives the chance. Among equal chances
+    the plan wins that loses the fewest atoms.
 
     Args:
         plans: The candidates, at least one.
@@ -166,15 +167,15 @@ def choose_plan(
     return min(plans, key=rank)
 
 
-# Fitted to flights of whole plans. From 1.944 um, a straight lane of the paper's lattice, to 2.4 um
-# the barrier of a static tweezer of 300 uK beside one of 2.1 mK rises by 290 to 310 uK per um, and the loss
-# falls by e for each 36 uK. A shallower tweezer lowers the barrier less.
+# Fitted to simulated flights of whole plans. From 1.944 um, a straight lane of the paper's lattice, to 2.4 um
+# # the barrier between a static tweezer of 300 uK and a tweezer of 2.1 mK rises by 290 to 310 uK per um, and
+# # the loss falls by a factor e for each 36 uK. A shallower tweezer lowers the barrier less.
 PASSED_M: Final = 1.944e-6
 PASS_DECAY_M: Final = 0.12e-6
 
 
 def pass_hazard(motion: MotionSpec, distance_m: float = PASSED_M) -> float:
-    """Hazard of an atom, and of the tweezer's own atom, where a tweezer passes at a distance in metres."""
+    """Hazard of an atom that a tweezer passes at a distance in metres, and of the tweezer's own atom."""
     hazard = -math.log1p(-motion.losses.passing) * motion.path_depth**2.2
     return hazard * math.exp((PASSED_M - distance_m) / PASS_DECAY_M)
 
@@ -184,7 +185,7 @@ MOVED, LANDED, PASSED = range(3)
 
 
 def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, motion: MotionSpec) -> tuple[Floats, int, int]:
-    """Hazards of the atom that ends on each site, float64 (3, n_rows, n_cols); landings and passes."""
+    """Hazards of the atom that ends on each site, float64 (3, n_rows, n_cols), with landings and passes."""
     losses = motion.losses
     hazard = pass_hazard(motion)
     hazards = np.zeros((3, *grid.shape))
@@ -221,7 +222,7 @@ def _hazards(plan: Plan, occupied: Occupancy, grid: SiteGrid, motion: MotionSpec
 
 
 def _batch_hazard(batch: Batch, grid: SiteGrid, losses: LossSpec) -> Floats:
-    """Hazard of each atom that a batch moves; ramps count where they are, at the start of linked batches."""
+    """Hazard of each atom that a batch moves. A chain of linked batches counts its ramps at its start."""
     a1, a2 = grid.axes
     if batch.tones is None:
         n_tones = [
@@ -241,7 +242,7 @@ def _batch_hazard(batch: Batch, grid: SiteGrid, losses: LossSpec) -> Floats:
 
 
 def landings(batch: Batch, paths: TonePaths, atoms: Occupancy) -> list[tuple[int, int]]:
-    """Sites of atoms that stand where an empty tweezer of a batch is ramped down."""
+    """Sites of atoms on which an empty tweezer of a batch is ramped down."""
     landings: list[tuple[int, int]] = []
     carried = {(int(i), int(j)) for i, j in paths.tones_of(batch.from_sites)}
     for i, row_off in enumerate(paths.row_off.tolist()):
@@ -257,11 +258,11 @@ def landings(batch: Batch, paths: TonePaths, atoms: Occupancy) -> list[tuple[int
 
 
 BESIDE: Final = 0.6
-"""A tweezer passes an atom if it comes closer than this part of the grid's spacing: a lane is at most 0.5."""
+"""A tweezer closer than this fraction of the spacing passes an atom. Lanes are at most 0.5 away."""
 
 
 def _passes(paths: TonePaths, atoms: Occupancy, grid: SiteGrid) -> tuple[Floats, Floats, int]:
-    """Weighted passes of tweezers by standing atoms, of each site and of each tweezer; how many there are."""
+    """Weighted passes of tweezers by standing atoms, for each site and each tweezer, and their number."""
     from labseq.motion.path_kernels import add_passes
 
     of_site, of_tweezer = np.zeros(grid.shape), np.zeros(paths.shape[1:])

@@ -1,4 +1,4 @@
-"""Kernel of the losses that line batches cause; plans with paths of tones are followed in Python."""
+"""Kernel of the losses that line batches cause. Python code follows plans with paths of tones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Moves = NDArray[np.int16]
 
 @helper_kernel(f"int64({const('int16', 2)}, int64, int64[::1])")
 def n_tones(batch: Moves, axis: int, seen: NDArray[np.int64]) -> int:
-    """Count the tones of an axis that a batch has on, rows (0) or columns (1); ``seen`` is work space."""
+    """Count the tones of an axis that a batch has on, rows (0) or columns (1). ``seen`` is scratch."""
     most = 0
     for end in (axis, axis + 2):
         n = 0
@@ -67,7 +67,7 @@ def line_hazards(
     seen = np.empty(most, np.int64)
     for number in range(len(linked)):
         batch = moves[offsets[number] : offsets[number + 1]]
-        ramps = 0.0  # they count where they are, at the start of linked batches
+        ramps = 0.0  # a chain counts its ramps at its start
         if not linked[number]:
             ramps = losses[0] + losses[1] * (n_tones(batch, 0, seen) + n_tones(batch, 1, seen) - 2)
         for i in range(len(batch)):

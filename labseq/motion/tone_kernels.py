@@ -1,9 +1,8 @@
 """Kernels that build tone programs and check them against limits.
 
-The tones of an axis are kept as rows of a float64 array: frequency in Hz at the
-start and at the end of the segment, amplitude at the start and at the end, and
-phase at the start, in cycles. The tones of a batch are int64 (2, >= n_tones): site and goal
-of each, in sites of the axis.
+The tones of an axis are rows of a float64 array, with frequency in Hz at the start and at the end of the
+segment, amplitude at the start and at the end, and phase at the start, in cycles. The tones of a batch are
+int64 (2, >= n_tones) with the site and the goal of each, in sites of the axis.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ def collect_tones(moves: Moves, start: int, stop: int, axis: int, n_sites: int, 
 
 @helper_kernel("int64(int64[:, :], int64)")
 def next_arrival(tones: Ints, travelled: int) -> int:
-    """Distance, in sites, at which the next tones arrive; ``travelled`` if all have."""
+    """Distance, in sites, at which the next tones arrive, or ``travelled`` if all have."""
     nearest = travelled
     for k in range(tones.shape[1]):
         distance = abs(tones[1, k] - tones[0, k])
@@ -90,7 +89,7 @@ def frequency(site_hz: Floats, step_hz: float, site: int) -> float:
 
 @helper_kernel(f"float64({SITES}, int64)")
 def amplitude(site_amplitude: Floats, site: int) -> float:
-    """Amplitude of the tone of a site; beyond the grid that of the outermost one."""
+    """Amplitude of the tone of a site, or of the outermost site if it is beyond the grid."""
     return site_amplitude[min(max(site, 0), len(site_amplitude) - 1)]
 
 
@@ -98,11 +97,11 @@ def amplitude(site_amplitude: Floats, site: int) -> float:
 def first_phases(
     tones: Ints, n_tones: int, preassigned: Floats, low_crest: bool, site_amplitude: Floats, phase: Floats
 ) -> None:
-    """Choose the phases of a batch's tones at pick-up, in cycles: as preassigned, or for a low crest factor.
+    """Choose the phases of a batch's tones at pick-up, in cycles, as preassigned or for a low crest factor.
 
-    The latter follow Schroeder (IEEE Trans. Inf. Theory 16, 85, 1970):
-    on a comb of teeth with relative powers p_l, the k-th has the phase
-    ``-2 pi sum_(l < k) (k - l) p_l``. Tones that are off count as teeth without power.
+    Phases for a low crest factor follow Schroeder (IEEE Trans. Inf. Theory 16, 85, 1970): on a comb of teeth
+    with relative powers p_l, the k-th has the phase ``-2 pi sum_(l < k) (k - l) p_l``. Tones that are off
+    count as teeth without power.
     """
     if not low_crest:
         for k in range(n_tones):
@@ -160,14 +159,14 @@ def add_tones(
     duration_s: float,
     phase: Floats,
 ) -> int:
-    """Add the tones of a segment to the ``n`` that there are; return how many there are then.
+    """Add the tones of a segment to ``n`` tones, and return their new number.
 
     Args:
-        values: float64 (5, capacity), the axis' tones so far; updated.
+        values: float64 (5, capacity), the axis' tones so far. Updated.
         n: How many there are.
         sites: The sites of the axis.
         tones: The batch's tones.
-        travelled: Sites travelled at the start; tones with a shorter way have arrived.
+        travelled: Sites travelled at the start. Tones with a shorter way have arrived.
         arriving: Sites travelled at the end.
         on_start: 0 if the tones are off at the start, 1 if they are on.
         on_end: The same for the end.
@@ -195,7 +194,7 @@ def add_tones(
 def add_segment(
     segments: Segments, n: int, kind: int, course: int, batch: int, duration_s: float, n_tones: int
 ) -> int:
-    """Add a segment that ends with ``n_tones`` tones in all; return the number of segments."""
+    """Add a segment that ends with ``n_tones`` tones in all, and return the number of segments."""
     labels, batch_of, durations_s, offsets = segments
     labels[0, n] = kind
     labels[1, n] = course
@@ -207,10 +206,10 @@ def add_segment(
 
 @helper_kernel("int64(int64[:, :], int64[:, :], int64, int64, boolean)")
 def next_joint(tones: Ints, others: Ints, travelled: int, course: int, is_uneven: bool) -> int:
-    """Distance, in sites, at which a transport is cut next; ``travelled`` if it is over.
+    """Distance, in sites, at which a transport is cut next, or ``travelled`` if it is over.
 
-    At constant speed that is where tones of either axis arrive, or at every site if amplitudes differ
-    from site to site; otherwise all start and stop together.
+    At constant speed it is cut where tones of either axis arrive, or at every site if amplitudes differ from
+    site to site. With another course all tones start and stop together.
     """
     if course != LINEAR:
         return max(last_arrival(tones), last_arrival(others))
@@ -225,7 +224,7 @@ def next_joint(tones: Ints, others: Ints, travelled: int, course: int, is_uneven
 
 @helper_kernel("float64(float64, float64, boolean)")
 def level(keyed_s: float, ramp_s: float, is_ramped: bool) -> float:
-    """Amplitude of an axis when the parked one is fully on: the depth changes evenly over the ramp."""
+    """Amplitude of an axis when the parked axis is fully on. The depth changes evenly over the ramp."""
     return float(np.sqrt(keyed_s / ramp_s)) if is_ramped else 1.0
 
 
@@ -250,11 +249,10 @@ def add_line_batch(
     values: Floats,
     phase: Floats,
 ) -> tuple[int, int]:
-    """Add the segments of a batch along lines; return the numbers of segments and of tones.
+    """Add the segments of a batch along lines, and return the numbers of segments and of tones.
 
-    ``tones`` are those of the axis, ``others`` those of the other one. A batch that ``follows`` is linked
-    to the one before and picks nothing up; one that ``leads`` has the next one linked to it and drops
-    nothing.
+    ``tones`` belong to the axis, ``others`` to the other axis. A batch that ``follows`` is linked to the
+    batch before and picks nothing up. A batch that ``leads`` is linked to the next and drops nothing.
     """
     pause_s, pick_up_s, site_s, drop_off_s, keyed_up_s, keyed_down_s = times_s
     ramped = last_arrival(tones) > 0 or (axis == 1 and last_arrival(others) == 0)
@@ -286,13 +284,13 @@ def add_line_batch(
 
 
 Batch = tuple[Floats, NDArray[np.int32], Shape, int, int]
-"""A batch with paths: positions, knots and shape as in :mod:`labseq.motion.path_kernels`; axis; index."""
+"""Positions, knots and shape of a batch as in :mod:`labseq.motion.path_kernels`, its axis and index."""
 BATCH: Final = f"Tuple(({POSITIONS}, {KNOTS}, UniTuple(int64, 3), int64, int64))"
 
 
 @helper_kernel(f"UniTuple(float64, 2)({SITES_OF_AXIS}, float64)")
 def tone_at(sites: Sites, place: float) -> tuple[float, float]:
-    """Frequency and amplitude of a tone at a place between sites: frequency and power change evenly."""
+    """Frequency and amplitude of a tone between sites, where frequency and power change evenly."""
     site_hz, step_hz, site_amplitude = sites
     below = int(np.floor(place))
     part = place - below
@@ -320,7 +318,7 @@ def add_path_tones(
     duration_s: float,
     phase: Floats,
 ) -> int:
-    """Add the tones of a segment from one knot to another or at one; return how many there are then.
+    """Add the tones of a segment between two knots or at one knot, and return their new number.
 
     Args:
         values: As in :func:`add_tones`.
@@ -329,8 +327,8 @@ def add_path_tones(
         of: The batch.
         knot: Where the segment starts.
         to_knot: Where it ends.
-        start: Amplitude at the start of tones that go off at ``to_knot``, relative to that of their place,
-            which all others have.
+        start: Amplitude at the start of tones that go off at ``to_knot``, relative to the amplitude of their
+            place, which all other tones have.
         end: The same at the end.
         duration_s: Duration of the segment.
         phase: float64 (>= n_tones,), phases in cycles; advanced to the segment's end.
@@ -368,10 +366,10 @@ def add_path_batch(
     values: Floats,
     phase: Floats,
 ) -> tuple[int, int]:
-    """Add the segments of a batch with paths of tones; return the numbers of segments and of tones.
+    """Add the segments of a batch with paths of tones, and return the numbers of segments and of tones.
 
-    Row tones are ramped, at the first and at the last knot while the column tones are switched; at a knot
-    in between the tones that go off are ramped, on both axes.
+    At the first and at the last knot row tones are ramped while column tones are switched. At a knot in
+    between the tones that go off are ramped, on both axes.
     """
     positions, off, shape, axis, batch = of
     pause_s, pick_up_s, site_s, drop_off_s, keyed_up_s, keyed_down_s = times_s
@@ -431,7 +429,7 @@ def room_for(
 ) -> tuple[int, int, int]:
     """The most segments that a plan's batches can need, and the most tones in them on each axis.
 
-    The first is NOT_ON_GRID if a source is not.
+    The first is NOT_ON_GRID if a source is not on the grid.
     """
     for k in range(batch_offsets[n_batches]):
         if not (0 <= moves[k, 0] < n_rows and 0 <= moves[k, 1] < n_cols):
@@ -480,19 +478,18 @@ def build_axis(
 ) -> tuple[int, int]:
     """Build all segments of a plan, and the tones of one axis in them.
 
-    At constant speed, tones with a shorter way arrive earlier; the transport is cut
-    there, so that each tone's frequency changes linearly, or not at all, within a
-    segment. Where amplitudes differ, it is cut at every site. With another course a
-    transport is one segment. The axis that moves is ramped at pick-up and drop-off; the
-    other one is switched on in the first microseconds of the pick-up, and off in the last of
-    the drop-off, which are segments of their own. A batch in which no atom moves counts as
-    moving along its row. For batches with paths of tones see :func:`add_path_batch`.
+    At constant speed, tones with a shorter way arrive earlier. The transport is cut there, so each tone's
+    frequency changes linearly, or not at all, within a segment. Where amplitudes differ, it is cut at every
+    site. With another course a transport is one segment. The axis that moves is ramped at pick-up and
+    drop-off. The other axis is switched on in the first microseconds of the pick-up, and off in the last of
+    the drop-off, which are segments of their own. A batch in which no atom moves counts as moving along its
+    row. For batches with paths of tones see :func:`add_path_batch`.
 
     Args:
         moves: int16 (n, 4), sources on the grid.
         batch_offsets: int32 (>= n_batches + 1,).
         linked: bool (>= n_batches,).
-        paths: Those of the plan.
+        paths: Paths of the plan.
         cosine: Of the angle between rows and columns.
         n_batches: Number of batches to build.
         axis: 0 for the row tones, 1 for the column tones.
@@ -501,11 +498,11 @@ def build_axis(
         path_amplitude: float64 (n_sites,), amplitude of each site's tone in batches with paths.
         preassigned: float64 (n_sites,), phase of each site's tone at pick-up, in cycles.
         low_crest: See :func:`first_phases`.
-        course: Of the transports, a value of :class:`labseq.model.FrequencyCourse`.
-        is_uneven: Whether amplitudes differ from site to site, on either axis.
-        times_s: float64 (6,): the pause before each batch that is not linked, the pick-up
-            ramp, the move by one site, the drop-off ramp, and how long the parked axis is
-            switched within the two ramps.
+        course: A :class:`labseq.model.FrequencyCourse`, the course of the transports.
+        is_uneven: True if amplitudes differ from site to site, on either axis.
+        times_s: float64 (6,), durations of the pause before each batch that is not linked, the pick-up ramp,
+            the move by one site, the drop-off ramp, and the switching of the parked axis within the two
+            ramps.
         segments: Result, arrays of sufficient length.
         values: Result, float64 (5, >= n_tones), the tones.
 
@@ -569,10 +566,10 @@ def amplitudes_at(values: Floats, first: int, last: int, u: float) -> tuple[floa
 
 @kernel(f"float64({VALUES}, int64, int64, float64)")
 def greatest_sum(values: Floats, first: int, last: int, limit: float) -> float:
-    """The largest sum of the amplitudes in a segment; exact only if it exceeds ``limit``.
+    """The largest sum of the amplitudes in a segment, exact only if it exceeds ``limit``.
 
-    Amplitudes squared are linear in time, so the sum is concave: where some rise and others
-    fall, it may be greatest in between, where its slope is 0.
+    Amplitudes squared are linear in time, so the sum is concave. If some rise and others fall, it may be
+    greatest in between, where its slope is 0.
     """
     at_start = at_end = bound = 0.0
     for i in range(first, last):
@@ -599,20 +596,19 @@ def greatest_sum(values: Floats, first: int, last: int, limit: float) -> float:
 def first_excess(offsets: Offsets, values: Floats, limits: Floats) -> tuple[int, int, float]:
     """Find the first tone of an axis that breaks a limit.
 
-    Frequencies all follow the same course in a segment, so the distance of two tones is
-    least at its start or its end, unless they pass one another; then its sign changes.
-    The power is linear in time, so it is greatest at the start or the end.
+    Frequencies all follow the same course in a segment, so the distance of two tones is least at its start or
+    its end, unless they pass one another and its sign changes. The power is linear in time, so it is greatest
+    at the start or the end.
 
     Args:
         offsets: int32 (n_segments + 1,), where each segment's tones start.
         values: float64 (5, n_tones), the tones.
-        limits: float64 (6,): lowest and highest frequency, least spacing, 1 or -1 where
-            frequencies rise or fall from tone to tone, greatest sum of the amplitudes, greatest
-            sum of their squares.
+        limits: float64 (6,) with lowest and highest frequency, least spacing, 1 or -1 where frequencies rise
+            or fall from tone to tone, greatest sum of the amplitudes, greatest sum of their squares.
 
     Returns:
-        The limit (WITHIN: none is broken), the tone, which is a segment's first where all
-        its tones are at fault, and the value that came.
+        The limit (WITHIN if none is broken), the tone, which is a segment's first if all its tones are at
+        fault, and the value.
     """
     low_hz, high_hz, spacing_hz, direction = limits[0], limits[1], limits[2], limits[3]
     for segment in range(len(offsets) - 1):

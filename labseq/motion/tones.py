@@ -1,4 +1,4 @@
-"""From a checked plan to the tones of each axis, within the limits of the AODs."""
+"""Turns a checked plan into the tones of each axis, within the limits of the AODs."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ AXIS_INDICES: Final[tuple[AxisIndex, AxisIndex]] = (0, 1)
 """Index of the row tones, index of the column tones."""
 
 SPEED_PROFILES: Final[tuple[SpeedProfile, ...]] = get_args(SpeedProfile)
-"""The speed profiles; the index is the :class:`labseq.model.FrequencyCourse`."""
+"""The speed profiles, in the order of :class:`labseq.model.FrequencyCourse`."""
 
 
 def site_time_s(grid: SiteGrid, motion: MotionSpec) -> float:
     """Time to move an atom by one site, in seconds.
 
-    With a course of the speed other than constant, that of the mean over the longest
-    way of a batch, so that a batch takes the same time whatever the course.
+    If the speed is not constant, this is the mean time over the longest way of a batch, so that a batch takes
+    the same time with every speed profile.
 
     Example:
         >>> round(site_time_s(SiteGrid(), MotionSpec()), 9)
@@ -36,7 +36,7 @@ def site_time_s(grid: SiteGrid, motion: MotionSpec) -> float:
 
 def keyed_time_s(ramp_s: float) -> float:
     """Time over which the tones of the parked axis are switched, within a ramp of the other axis."""
-    # switched on or off at once, it would put more than a hundred times as much power outside the AOD's band
+    # an abrupt switch would put more than a hundred times as much power outside the AOD's band
     return min(2e-6, 0.5 * ramp_s)
 
 
@@ -92,42 +92,39 @@ def tone_program(
 ) -> ToneProgram:
     """Turn a checked plan into a tone program, with the paper's timing.
 
-    For each batch: a pause without tones (the overhead of a batch; that of the cycle
-    has passed before anything plays), the pick-up, the transport, and the drop-off. A
-    transport at constant speed is cut wherever a tone arrives. With another speed
-    profile all tones start and arrive together, each with its own way; the longest way of
-    the batch has the mean speed of the setting, so that the batch lasts as long as at
-    constant speed. At pick-up and drop-off the tones of the axis that moves are ramped,
-    linearly in trap depth; those of the other axis are switched on and off over 2 us at its two ends.
-    Between linked batches there is no drop-off, pause and pick-up.
+    Each batch has a pause without tones, the pick-up, the transport and the drop-off. The pause is the
+    overhead of a batch. The overhead of the cycle has passed before anything plays. A transport at constant
+    speed is cut wherever a tone arrives. With another speed profile all tones start and arrive together, each
+    with its own way. The longest way of the batch has the mean speed of the setting, so that the batch lasts
+    as long as at constant speed. At pick-up and drop-off the tones of the axis that moves are ramped,
+    linearly in trap depth. The tones of the other axis are switched on and off over 2 us at the two ends of
+    the batch. There is no drop-off, pause or pick-up between linked batches.
 
-    In a batch with paths of tones each leg is a segment, whose longest way has the mean speed of the
-    setting; between sites frequency and amplitude squared are interpolated. Row tones are ramped, and at
-    a knot before the last the tones that go off there, while the others wait. The row tones are
-    weaker by the square root of ``path_depth``.
+    In a batch with paths of tones each leg is a segment, whose longest way has the mean speed of the setting.
+    Frequency and amplitude squared are interpolated between sites. Row tones are ramped. At a knot before the
+    last, the tones that go off there are ramped while the others wait. The row tones are weaker by the square
+    root of ``path_depth``.
 
-    Each site's tone has a preassigned amplitude; by default all are equal, such that
-    the most tones an axis may have reach full scale together. During a transport at constant
-    speed the amplitude squared goes evenly from that of each site to that of the next; with
-    another speed profile from that of the source to that of the goal. Phases
-    start as preassigned or chosen and are continuous within a batch and a chain. Beyond
-    the grid's edge frequencies go on linearly, amplitudes stay. Calibrated tones that are
-    all within ``rf.snap_within_m`` of a comb are played on it (see
-    :func:`labseq.motion.drive` for how far they were moved).
+    Each site's tone has a preassigned amplitude. By default all are equal, and the largest number of tones of
+    an axis reaches full scale. During a transport at constant speed the amplitude squared changes linearly
+    from each site to the next, and with another speed profile from the source to the goal. Phases start as
+    preassigned or chosen and are continuous within a batch and a chain. Beyond the grid's edge frequencies
+    continue linearly, and amplitudes stay constant. Calibrated tones that are all within ``rf.snap_within_m``
+    of a comb are played on it (see :func:`labseq.motion.drive` for how far they were moved).
 
     Args:
         plan: A plan that :func:`check_plan` accepted.
-        grid: The grid of sites; by default the paper's.
-        motion: How the tweezers move; by default as in the paper.
-        n_batches: How many batches to play, from the first; by default all.
+        grid: The grid of sites. By default the paper's.
+        motion: How the tweezers move. By default as in the paper.
+        n_batches: How many batches to play, from the first. By default all.
 
     Returns:
         The tones of both axes.
 
     Raises:
-        PlanError: The plan does not fit onto the grid, or has fewer batches than asked for.
-        LimitError: Tones break a limit of AOD or amplifier (band, number, spacing, sum of
-            amplitudes, peak voltage, mean power), or the amplitudes are not one per site.
+        PlanError: The plan does not fit on the grid, or has fewer batches than requested.
+        LimitError: Tones break a limit of AOD or amplifier (band, number, spacing, sum of amplitudes, peak
+            voltage, mean power), or the number of amplitudes is not the number of sites.
     """
     from labseq.motion.tone_kernels import N_FIELDS, NOT_ON_GRID, PHASE, build_axis, room_for
 
@@ -135,7 +132,7 @@ def tone_program(
     motion = motion or MotionSpec()
     n_batches = plan.n_batches if n_batches is None else n_batches
     if not 0 <= n_batches <= plan.n_batches:
-        raise PlanError(f"the plan has {plan.n_batches} batches; {n_batches} cannot be played")
+        raise PlanError(f"the plan has {plan.n_batches} batches, so {n_batches} cannot be played")
     times_s = _times_s(grid, motion)
     course = SPEED_PROFILES.index(motion.speed_profile)
     drives = [drive(grid, motion, axis) for axis in AXIS_INDICES]
@@ -145,7 +142,7 @@ def tone_program(
     )
     if n_segments == NOT_ON_GRID:
         size = f"{grid.n_rows} x {grid.n_cols} sites"
-        raise PlanError(f"the plan does not fit onto the grid of {size}; check it first")
+        raise PlanError(f"the plan does not fit on the grid of {size}; check it first")
     cosine = float(path_geometry(grid, motion)[1])
     labels = np.empty((2, n_segments), np.int8)
     batch = np.empty(n_segments, np.int32)
@@ -200,16 +197,16 @@ def check_limits(
 
     Args:
         axis: 0 for the rows' tones, 1 for the columns'.
-        drive: What the axis is driven with, and its limits.
-        rf: The limits in the words of the profile.
+        drive: Frequencies, amplitudes and limits of the axis.
+        rf: The limits, as the profile states them.
         batch: int32 (>= n_segments,), batch of each segment.
         offsets: int32 (n_segments + 1,), where each segment's tones start.
         values: float64 (5, >= n_tones), the tones, see :mod:`labseq.motion.tone_kernels`.
 
     Raises:
-        LimitError: Too many tones, one outside of the AOD's band, two too close to one another,
-            amplitudes that add up to more than full scale or than the amplifier bears, or too
-            much mean power. It names the batch and the tone.
+        LimitError: Too many tones, a tone outside the AOD's band, two tones too close together, amplitudes
+            that exceed full scale or the amplifier's limit, or too much mean power. It names the batch and
+            the tone.
     """
     from labseq.motion.tone_kernels import WITHIN, first_excess
 

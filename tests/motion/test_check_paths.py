@@ -90,9 +90,9 @@ LANDS = {"empty_tweezers_may_land": True}
         ("crossing", r"at the atom on \(0, 2\)", "#.#.", [(0, 0, 0, 1)], along([0, 1.75], [1, 3]), {}),
         ("path", r"closer than 1.9 um to .* on \(0, 1\)", "##.", [(0, 0, 0, 2)], along([0], [2]), {}),
         ("path", r"an atom ends on the atom on \(0, 3\)", "#..#", [(0, 0, 0, 1)], along([0, 2], [1, 3]), {}),
-        ("path", r"stands on \(0, 2\)", "#.#.", [(0, 0, 0, 1)], along([0, 1], [1, 3]), LANDS),
+        ("path", r"atom on \(0, 2\)", "#.#.", [(0, 0, 0, 1)], along([0, 1], [1, 3]), LANDS),
         # the atom of row 0 is dropped off, and in the leg that follows the tweezer of row 3 passes over it
-        ("path", r"stands on \(0, 0\)", "# . . #", [(0, 0, 0, 0), (3, 0, -1, 0)],
+        ("path", r"atom on \(0, 0\)", "# . . #", [(0, 0, 0, 0), (3, 0, -1, 0)],
          paths([[0, 3], [0, 3], [0, -1]], [[0], [0], [0]], [1, 2]), {}),
     ],
 )  # fmt: skip
@@ -120,7 +120,7 @@ def test_short_legs_towards_an_atom_and_back(grid: SiteGrid) -> None:
             if nearest > 1.0:
                 assert check("#.. .#. ...", visit, grid=grid).predicted.sum() == 2
                 continue
-            with pytest.raises(InvalidPlanError, match=r"stands on \(1, 1\)"):
+            with pytest.raises(InvalidPlanError, match=r"atom on \(1, 1\)"):
                 check("#.. .#. ...", visit, grid=grid)
 
 
