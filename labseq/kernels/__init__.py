@@ -1,1 +1,1 @@
-"""Compiled functions: the decorator with its cache, and C, clocks and signals for compiled code."""
+"""Compiles functions with a cache, and gives compiled code access to C, clocks and signals."""

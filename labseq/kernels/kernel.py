@@ -1,13 +1,13 @@
-"""Compiled functions: numba with explicit signatures, and a cache that knows what a kernel is made of.
+"""Compiles functions by numba with explicit signatures, and caches them by all that they are compiled from.
 
-Because every kernel has explicit signatures, no new dtype or layout can cost a compile
-in the middle of a shot. :func:`load_kernels` compiles the kernels of all imported modules or
-loads them from the user's cache; otherwise the first call of a kernel does. Several processes
-compile what the cache lacks. numba itself is imported only then.
+Because every kernel has explicit signatures, no new dtype or layout can cost a compile in the middle of a
+shot. :func:`load_kernels` compiles the kernels of all imported modules or loads them from the user's cache.
+Without it, the first call of a kernel does. Several processes compile the missing kernels. numba itself is
+imported only then.
 
-The cache is numba's own, which does not notice that a constant or a function in another file has changed.
-Each kernel therefore has a folder that is named after all that it is compiled from: its bytecode, the
-constants that it names, the same of all kernels that it calls, and the versions of Python, numba and numpy.
+The cache is numba's own, which does not notice that a constant or a function in another file has changed. The
+folder of each kernel is therefore named after all that it is compiled from, which is its bytecode and the
+constants that it names, the same for all kernels that it calls, and the versions of Python, numba and numpy.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from labseq.files import cache_root
 F = TypeVar("F", bound=Callable[..., Any])
 
 WORTH_A_PROCESS_S: Final = 3.0
-"""Kernels that would compile faster than this are compiled in this process."""
+"""Kernels that compile faster than this, in seconds, are compiled in this process."""
 
 _INTERPRETED = threading.Event()
-_PENDING: dict[_Kernel, None] = {}  # neither compiled nor loaded yet
+_PENDING: dict[_Kernel, None] = {}  # not compiled or loaded yet
 _ANNOUNCE: list[Callable[[float], None]] = []
 _LOADING = threading.RLock()
 _TEACH: list[Callable[[], object]] = []
@@ -49,8 +49,7 @@ _TEACH: list[Callable[[], object]] = []
 def const(dtype: str, ndim: int) -> str:
     """Type of a C-contiguous array that a kernel only reads, for a signature.
 
-    Takes read-only and writeable arrays alike; numba's ``dtype[:, ::1]`` refuses
-    read-only ones.
+    Takes read-only and writeable arrays. numba's ``dtype[:, ::1]`` refuses read-only arrays.
 
     Example:
         >>> const("bool_", 2)
@@ -65,26 +64,25 @@ def kernel(signature: str | Sequence[str], *, fused: bool = False, for_c: bool =
     With ``NUMBA_DISABLE_JIT=1`` the function stays plain Python.
 
     Args:
-        signature: numba signature such as ``f"int64({const('bool_', 2)}, float64)"``,
-            or several of them.
-        fused: Let ``a * b + c`` be rounded once instead of twice, where the processor
-            can. That is faster, but the last digit may differ between processors.
-        for_c: Code in C calls it, by :func:`c_address`, and Python does not; its only signature takes and
-            returns int64.
+        signature: numba signature such as ``f"int64({const('bool_', 2)}, float64)"``, or several signatures.
+        fused: Let ``a * b + c`` be rounded once instead of twice, if the processor can. That is faster, but
+            the last digit may differ between processors.
+        for_c: Only code in C calls the kernel, by :func:`c_address`. Its only signature takes and returns
+            int64.
     """
     return _decorator(signature, fused, is_helper=False, for_c=for_c)
 
 
 def c_address(function: Callable[..., Any]) -> int:
-    """Address at which code in C can call a kernel that is made for it; it is loaded if need be."""
+    """Address at which code in C can call a kernel made with ``for_c``, which is loaded if necessary."""
     return cast("_Kernel", function).c_address
 
 
 def helper_kernel(signature: str | Sequence[str] = (), *, fused: bool = False) -> Callable[[F], F]:
-    """Like :func:`kernel`, for a function that only kernels call: nothing to load if they are in the cache.
+    """Like :func:`kernel`, for a function that only kernels call. It is not loaded if they are in the cache.
 
-    Without a signature numba infers the types, and the function is compiled as part of each kernel that
-    calls it. Python may call it, too; the first call then compiles it, or loads it from the cache.
+    Without a signature numba infers the types, and the function is compiled as part of each kernel that calls
+    it. Python may also call it. The first call then compiles it, or loads it from the cache.
     """
     return _decorator(signature, fused, is_helper=True)
 
@@ -114,7 +112,7 @@ def announcing(announce: Callable[[float], None]) -> Generator[None]:
 
 
 def cache_problem() -> str:
-    """Why what is compiled cannot be kept, with what to do; "" if it can."""
+    """Why compiled kernels cannot be cached, and the remedy, or "" if they can."""
     folder, remedy = "the user's cache", "set LABSEQ_CACHE to a folder that you may write to"
     try:
         folder = str(cache_root())
@@ -123,14 +121,14 @@ def cache_problem() -> str:
             return ""
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        return f"{folder} cannot be written ({reason.lower()}): {remedy}"
+        return f"{folder} cannot be written ({reason.lower()}); {remedy}"
 
 
 def load_kernels(poll: Callable[[], None] = lambda: None) -> None:
     """Compile the kernels of all modules imported so far, or load them from the cache.
 
     Args:
-        poll: Called while it waits for processes, and before each kernel.
+        poll: Called while waiting for processes, and before each kernel.
 
     Raises:
         PluginLoadError: A kernel cannot be compiled.
@@ -161,7 +159,7 @@ def _decorator(
 
 @cache
 def _numba() -> Any:
-    """numba, which knows how kernels call other kernels."""
+    """numba, after it has learned how kernels call other kernels."""
     import numba
     from llvmlite import binding
     from numba.extending import typeof_impl
@@ -221,12 +219,12 @@ class _Kernel:
         return self.function.__qualname__
 
     def load(self) -> None:
-        """Compile it, or load it from the cache, for those that call it: C, Python, or only kernels."""
+        """Compile it, or load it from the cache, for its callers, which are C, Python, or only kernels."""
         _ = self.c_address if self.for_c else self.dispatcher
 
     @property
     def dispatcher(self) -> Any:
-        """What other kernels call, compiled or loaded from the cache; Python, too, unless it is a helper."""
+        """The compiled or loaded function that other kernels call, and also Python unless it is a helper."""
         return self._dispatcher(self._kind)
 
     def _dispatcher(self, kind: str) -> Any:
@@ -238,13 +236,13 @@ class _Kernel:
         return self._dispatchers[kind]
 
     def _compile(self, kind: str, file: Path | None) -> None:
-        """Compile for Python or for other kernels; see :meth:`_function` for ``file``."""
-        # only what Python calls can take Python's objects: that takes a fifth of the time for compiling
+        """Compile for Python or for other kernels, with ``file`` as in :meth:`_function`."""
+        # only functions that Python calls take Python's objects, which needs a fifth of the compile time
         options = self._options | {"cache": file is not None, "no_cpython_wrapper": kind == "kernels"}
         dispatcher = self._dispatchers[kind] = _numba().njit(**options)(self._function(file))
         try:
             for signature in self.signatures:
-                dispatcher.compile(signature)  # which may need the dispatcher, for calls of itself
+                dispatcher.compile(signature)  # it may need the dispatcher, to call itself
         except BaseException:
             del self._dispatchers[kind]
             raise
@@ -253,7 +251,7 @@ class _Kernel:
 
     @cached_property
     def c_address(self) -> int:
-        """See :func:`c_address`; of a function in Python where kernels are not compiled."""
+        """See :func:`c_address`. Gives the address of a Python function if kernels are not compiled."""
         if _is_interpreted():
             word = ctypes.c_int64
             self._c = ctypes.CFUNCTYPE(word, *[word] * self.function.__code__.co_argcount)(self.function)
@@ -268,7 +266,7 @@ class _Kernel:
         self._c: Any = compiler(self._function(file))
 
     def _function(self, file: Path | None) -> FunctionType:
-        """The function as if it stood alone in a file, for numba's cache; None for no cache.
+        """The function as if it were alone in ``file``, for numba's cache. None means no cache.
 
         numba looks at the file of a function and at its line, and would compile it again in another copy
         of labseq, or after another function in its file was edited.
@@ -298,7 +296,7 @@ class _Kernel:
         settings.CACHE_DIR = str(folder)
         try:
             compile_it(cached_file)
-        except Exception:  # noqa: BLE001 - a crash may have truncated any file; other errors come again
+        except Exception:  # noqa: BLE001 - a crash may have truncated any file, and other errors come again
             shutil.rmtree(folder, ignore_errors=True)
             _announce_compiling(self)
             try:
@@ -311,7 +309,7 @@ class _Kernel:
 
     @property
     def folder(self) -> Path:
-        """Its folder in the cache."""
+        """The kernel's folder in the cache."""
         return cache_root() / "kernels" / f"{self.function.__name__}-{self.digest}"
 
     @property
@@ -327,7 +325,7 @@ class _Kernel:
         return 0.0044 * len(self.signatures) * n_instructions
 
     def is_in_use(self) -> bool:
-        """Whether its module is the imported one, and not one that was edited and imported again since."""
+        """False if its module was edited and imported again since."""
         return getattr(sys.modules.get(self.module), "__dict__", None) is self.function.__globals__
 
     def is_cached(self) -> bool:
@@ -335,13 +333,13 @@ class _Kernel:
 
     @cached_property
     def named(self) -> dict[str, Any]:
-        """The values of all names in its code that are not its own variables."""
+        """Values of all names in its code except its own variables."""
         code, cells = self.function.__code__, self.function.__closure__ or ()
         scope = self.function.__globals__ | dict(zip(code.co_freevars, cells, strict=True))
         objects = {name: scope[name] for name in _names(code) if name in scope}
         values = {name: getattr(value, "cell_contents", value) for name, value in objects.items()}
         modules = [value for value in values.values() if isinstance(value, ModuleType)]
-        for module in modules:  # and those in them: a.b.SPEED
+        for module in modules:  # and their values, such as a.b.SPEED
             of_module = {name: vars(module)[name] for name in _names(code) if name in vars(module)}
             values |= {f"{module.__name__}.{name}": value for name, value in of_module.items()}
             modules += [
@@ -353,7 +351,7 @@ class _Kernel:
 
     @cached_property
     def callees(self) -> list[_Kernel]:
-        """The kernels that it calls, and those that they call."""
+        """The kernels that it calls, directly or through other kernels."""
         reached: list[_Kernel] = [self]
         for item in reached:
             called = [value for value in item.named.values() if isinstance(value, _Kernel)]
@@ -362,7 +360,7 @@ class _Kernel:
 
     @cached_property
     def source(self) -> str:
-        """What it is compiled from, without the kernels that it calls."""
+        """Text of all that it is compiled from, without the kernels that it calls."""
         constants = [_constant(name, value) for name, value in sorted(self.named.items())]
         options = (self.module, self.function.__qualname__, self.signatures, self._options, self.for_c)
         return repr((options, _code(self.function.__code__), [text for text in constants if text]))
@@ -376,14 +374,14 @@ class _Kernel:
 
 @cache
 def _environment() -> str:
-    """Text of everything but its source that a kernel depends on, and that numba does not look at."""
+    """Text of everything except its source that a kernel depends on, and that numba ignores."""
     settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
     taught = Path(__file__).with_name("native_code.py").read_bytes()  # of functions that kernels call
     return repr((sys.version, *map(version, ("numba", "llvmlite", "numpy")), settings, taught))
 
 
 def _names(code: CodeType) -> Iterator[str]:
-    """All names in a function's code, and in that of the functions within it."""
+    """All names in the code of a function and of the functions within it."""
     yield from (*code.co_names, *code.co_freevars)
     for value in code.co_consts:
         if isinstance(value, CodeType):
@@ -398,7 +396,7 @@ def _code(code: CodeType) -> tuple[object, ...]:
 
 
 def _constant(name: str, value: object) -> str:
-    """Text of a constant that a kernel is compiled with; "" for anything else."""
+    """Text of a constant that a kernel is compiled with, or "" for anything else."""
     if isinstance(value, np.ndarray):
         return repr((name, value.dtype.str, value.shape, value.tobytes()))
     if isinstance(value, tuple):
@@ -409,7 +407,7 @@ def _constant(name: str, value: object) -> str:
         return repr((name, type(value).__name__, value))
     if isinstance(value, type) and hasattr(value, "__members__"):  # an enumeration
         return repr((name, list(cast("Any", value))))
-    if isinstance(value, np.dtype):  # of records: names and places of the columns
+    if isinstance(value, np.dtype):  # of records, with names and places of the columns
         return repr((name, dict(cast("Any", value).fields or {})))
     if isinstance(value, type) and hasattr(value, "_fields"):  # a named tuple
         return repr((name, cast("Any", value)._fields))
@@ -423,7 +421,7 @@ def _announce_compiling(kernel: _Kernel) -> None:
 
 
 def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> None:
-    """Let several processes compile kernels into the cache, a module at a time; failures are ignored."""
+    """Let several processes compile kernels into the cache, a module at a time. Failures are ignored."""
     import multiprocessing
     from graphlib import TopologicalSorter
 
@@ -436,9 +434,9 @@ def _compile_in_processes(kernels: list[_Kernel], poll: Callable[[], None]) -> N
     # each process needs about 200 MB
     n_workers = min(4, n_cores(), len(seconds))
     if multiprocessing.current_process().daemon:
-        return  # it may not start processes: a worker of a campaign or a cluster
+        return  # workers of a campaign or a cluster may not start processes
     if cache_problem():
-        return  # what they compile would be lost
+        return  # the compiled kernels would be lost
     if n_workers < 2 or sum(seconds.values()) < WORTH_A_PROCESS_S:
         return
     while _ANNOUNCE:
@@ -488,7 +486,7 @@ _CLEANED: set[Path] = set()
 def _delete_unused(root: Path) -> None:
     """Delete folders of kernels that no process has loaded for long, once per process.
 
-    A clock that is ahead deletes none: the age of a folder is at most that against the last one loaded.
+    The age of a folder counts at most up to the last loaded folder, so a clock that is ahead deletes none.
     """
     if root in _CLEANED:
         return

@@ -1,7 +1,7 @@
-"""For kernels that call functions in C, read memory by its address, and keep time, without Python's lock.
+"""Lets kernels call functions in C, read memory by its address, and keep time, without Python's lock.
 
-A kernel that runs in a thread of its own for as long as a run takes cannot be given new arguments: it finds
-what changes at addresses. Addresses and handles are int64 throughout.
+A kernel that runs in its own thread during a whole run cannot be given new arguments, so it finds changing
+values at addresses. Addresses and handles are int64 throughout.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _FUNCTION: Final = ctypes.CFUNCTYPE(ctypes.c_uint32, *[ctypes.c_int64] * 3)
 
 
 def call_c(address: Any, a: Any, b: Any, c: Any) -> Any:
-    """Call a C function with up to three integers or pointers; returns its uint32.
+    """Call a C function with up to three integers or pointers, and return its uint32.
 
-    Arguments that it does not take are ignored, as in the calling conventions of all 64-bit systems.
+    Extra arguments are ignored, as in the calling conventions of all 64-bit systems.
     """
     return int(_FUNCTION(int(address))(int(a), int(b), int(c)))
 
@@ -40,14 +40,14 @@ def pointer(address: Any) -> Any:
 
 
 def carray(pointer: Any, shape: Any, dtype: Any) -> Any:
-    """The array at an address: ``carray(pointer(address), shape, dtype)``."""
+    """The array at an address, by ``carray(pointer(address), shape, dtype)``."""
     n_bytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
     memory: Any = (ctypes.c_char * n_bytes).from_address(int(pointer))
     return np.frombuffer(memory, dtype).reshape(shape)
 
 
 def swap(address: Any, value: Any) -> Any:
-    """Set an int64 and return what it was, in one step for all threads."""
+    """Set an int64 and return its old value, in one step for all threads."""
     word = ctypes.c_int64.from_address(int(address))
     before, word.value = word.value, value
     return before
@@ -62,7 +62,7 @@ _CLOCK, _FIRST, _SECOND, _SCALE, _PER, _SLEEP, _SECONDS, _TICKS, _PAUSE = range(
 def new_timer(timer: Ints | None = None) -> Ints:
     """int64 (N_TIMER,), new or given, for :func:`now_ns` and :func:`sleep_ns`, by one thread at a time.
 
-    The time is that of ``time.perf_counter``.
+    The time has the zero and rate of ``time.perf_counter``.
     """
     timer = np.zeros(N_TIMER, np.int64) if timer is None else timer
     address = timer.ctypes.data + 8 * _SECONDS
@@ -91,7 +91,7 @@ def now_ns(timer: Ints) -> int:
 
 @helper_kernel("void(int64[::1], int64)")
 def sleep_ns(timer: Ints, duration_ns: int) -> None:
-    """Wait less than a second; on Windows it returns as soon as other threads had their turn."""
+    """Wait less than a second. On Windows it returns as soon as other threads had their turn."""
     timer[_PAUSE], timer[_PAUSE + 1] = 0, duration_ns
     call_c(timer[_SLEEP], timer[_PAUSE:].ctypes.data, 0, 0)
 
@@ -102,10 +102,10 @@ POLLIN: Final = 1
 
 
 class WakeSignal:
-    """What a kernel in one thread waits for, and another thread sets; it may be set before somebody waits.
+    """Signal that one thread sets and a kernel in another waits for. It may be set before the wait starts.
 
     Attributes:
-        words: For :func:`wait_signal` and :func:`set_signal`.
+        words: Argument of :func:`wait_signal` and :func:`set_signal`.
     """
 
     def __init__(self) -> None:
@@ -133,13 +133,13 @@ class WakeSignal:
 
 @kernel("void(int64[::1])")
 def set_signal(words: Ints) -> None:
-    """Wake the thread that waits, or the next one that does; nothing happens if it is set very often."""
+    """Wake the waiting thread, or the next thread that waits. Nothing happens if it is set very often."""
     call_c(words[_GIVE], words[_SETS], words[_BYTES:].ctypes.data, 1)
 
 
 @helper_kernel("void(int64[::1], int64)")
 def wait_signal(words: Ints, most_ms: int) -> None:
-    """Wait until a signal is set, at most some milliseconds; its words are used by one thread at a time."""
+    """Wait until a signal is set, at most ``most_ms``. One thread at a time may use its words."""
     if words[_TAKE] == 0:
         call_c(words[_WAIT], words[_HANDLE], most_ms, 0)
     elif call_c(words[_WAIT], words[_ENTRY:].ctypes.data, 1, most_ms) == 1:

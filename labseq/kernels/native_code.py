@@ -1,6 +1,6 @@
-"""What the functions of `labseq.kernels.native` are in compiled code; imported when numba is.
+"""The functions of `labseq.kernels.native` in compiled code. Imported together with numba.
 
-numba looks at the names of arguments: those of a function, of its overload and of the intrinsic must agree.
+numba looks at the names of arguments, which must agree between a function, its overload and the intrinsic.
 """
 # ruff: noqa: ARG001
 # pyright: basic, reportCallIssue=false, reportPrivateImportUsage=false
@@ -19,7 +19,7 @@ _C_FUNCTION = ir.FunctionType(ir.IntType(32), [_WORD] * 3)
 @intrinsic
 def _call(context, address, a, b, c):
     def code(context, builder, signature, values):
-        builder.fence("seq_cst")  # other threads see in order what is written before and after
+        builder.fence("seq_cst")  # other threads see writes before and after in order
         result = builder.call(builder.inttoptr(values[0], _C_FUNCTION.as_pointer()), values[1:])
         builder.fence("seq_cst")
         return builder.zext(result, _WORD)

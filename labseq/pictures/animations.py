@@ -1,4 +1,4 @@
-"""Animations of plans: GIF files, and pages with a player."""
+"""Animations of plans as GIF files and pages with a player."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ COLOURS: Final = {
     "bg": "#ffffff", "ink": "#1b2530", "ink-2": "#5a6877", "site": "#b9c3cd", "goal": "#dfeaf4",
     "atom": "#2f6fae", "move": "#e07b1a", "error": "#c8102e",
 }  # fmt: skip
-"""Colours of sites, target, atoms, tweezers, and of atoms that are or will be lost."""
+"""Colours of sites, target, atoms, tweezers, and atoms that are or will be lost."""
 FRAMES_PER_S: Final = 20
 HOLD_MS: Final = (600, 2500)
-"""How long the first and the last frame stand."""
+"""How long the first and the last frame are shown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Animation:
-    """What is animated: the motion, and two lines of text above it."""
+    """A motion to animate, and two lines of text above it."""
 
     title: str
     source: str
@@ -55,8 +55,8 @@ def check_animation(path: Path, shape: tuple[int, int]) -> None:
     """Check that an animation of (n_rows, n_cols) sites can be made and saved, before anything is planned.
 
     Raises:
-        ConfigError: The file has another ending than .gif and .html, its folder does not exist, the array is
-            too large, or matplotlib is not installed, which a GIF needs.
+        ConfigError: The name does not end in .gif or .html, its folder does not exist, the array is too
+            large, or a GIF needs matplotlib, which is not installed.
     """
     check_place(path, ENDINGS, drawn=path.suffix.lower() != ".html")
     check_size(path, shape)
@@ -72,10 +72,10 @@ def save_animation(path: Path, animation: Animation) -> None:
 
 
 def _page(animation: Animation) -> bytes:
-    """A page that needs no other file: the motion as JSON, and the script that plays it."""
+    """A self-contained page with the motion as JSON and the script that plays it."""
     folder = files("labseq.pictures")
     script, style = (folder.joinpath(name).read_text("utf-8") for name in ("player.js", "player.css"))
-    # "<" would let a name end the script
+    # "<" could let a name end the script
     scene = json.dumps(animation.playback.as_json(), separators=(",", ":")).replace("<", "\\u003c")
     colours = "; ".join(f"--{name}: {value}" for name, value in COLOURS.items())
     title, source = escape(animation.title), escape(animation.source)
@@ -130,7 +130,7 @@ def _gif(animation: Animation) -> bytes:
 
 
 def _palette() -> Image:
-    """The colours of all frames: what is drawn on what, with the shades of its rim and of its fading."""
+    """The colours of all frames, with the shades of rims and fading on each background."""
     from PIL import Image
 
     shades = {"move": 10, "atom": 5, "site": 2, "ink": 4, "ink-2": 3, "error": 3}
@@ -151,7 +151,7 @@ def _rgb(name: str) -> list[int]:
 
 
 class _Drawing:
-    """A figure whose sites are drawn once, and the rest for each frame."""
+    """A figure that draws its sites once, and the rest for each frame."""
 
     def __init__(self, animation: Animation) -> None:
         self._playback = playback = animation.playback
@@ -199,7 +199,7 @@ def _sheet(animation: Animation, extent: Extent, site_in: float) -> Figure:
 
 
 def _draw_sites(axes: Axes, playback: Playback, site_in: float) -> None:
-    """Draw the target and the sites, which stand still, and the key."""
+    """Draw the target, the sites and the key, which do not move."""
     from matplotlib.lines import Line2D
 
     points, grid = site_in * POINTS_PER_INCH, playback.grid
@@ -262,7 +262,7 @@ class _Artists:
         )  # fmt: skip
 
     def show(self, playback: Playback, t_s: float) -> None:
-        """Move everything to where it is at a time."""
+        """Move everything to its place at a time."""
         grid, frame = playback.grid, playback.at(t_s)
         n_rows, n_cols = grid.shape
         rows = [[(row, -0.8), (row, n_cols - 0.2)] for row in frame.rows[:, 0]]
@@ -288,7 +288,7 @@ class _Artists:
 
 
 def _faded(depth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The colour of tweezers, float64 (n, 4), the more transparent the less deep they are."""
+    """The colour of tweezers, float64 (n, 4), more transparent for less deep tweezers."""
     from matplotlib.colors import to_rgba
 
     colours = np.tile(to_rgba(COLOURS["move"]), (len(depth), 1))

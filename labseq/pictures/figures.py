@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 ENDINGS: Final = (".png", ".svg", ".pdf")
 """File name endings of pictures."""
 DARK, LIGHT, ORANGE, RED = "#1f4e8c", "#86b6e0", "#f28e2b", "#c8102e"
-"""Colours of points and lines, of areas, of a second series, and of what they are compared with."""
+"""Colours of points and lines, of areas, of a second series, and of reference values."""
 
 
 def check_place(path: Path, endings: Sequence[str] = ENDINGS, *, drawn: bool = True) -> None:
@@ -34,11 +34,11 @@ def check_place(path: Path, endings: Sequence[str] = ENDINGS, *, drawn: bool = T
 
     Args:
         path: The file.
-        endings: The endings that its name may have.
-        drawn: Whether matplotlib draws it.
+        endings: Allowed endings of its name.
+        drawn: True if matplotlib draws it.
 
     Raises:
-        ConfigError: The file has another ending, its folder does not exist, or matplotlib is not installed.
+        ConfigError: The name has another ending, its folder does not exist, or matplotlib is not installed.
     """
     name, wanted = str(path), f"a file that ends in {' or '.join(endings)}"
     if path.suffix.lower() not in endings:
@@ -50,7 +50,7 @@ def check_place(path: Path, endings: Sequence[str] = ENDINGS, *, drawn: bool = T
     except OSError as error:  # a name that is too long
         raise ConfigError(Problem(f"this is not the name of a file: {error.strerror}", name)) from error
     if not has_folder:
-        raise ConfigError(Problem("there is no such folder", str(path.parent), expected="one that exists"))
+        raise ConfigError(Problem("there is no such folder", str(path.parent), expected="an existing folder"))
     if is_odd:
         what = "this is a folder" if is_folder else "this is not an ordinary file"
         raise ConfigError(Problem(what, name, expected=wanted))
@@ -60,7 +60,7 @@ def check_place(path: Path, endings: Sequence[str] = ENDINGS, *, drawn: bool = T
 
 
 def make_figure(width_in: float, height_in: float, **options: Any) -> Figure:
-    """Make a figure of a size in inches that needs no screen; options are those of ``Figure``."""
+    """Make a figure of a size in inches that needs no screen, with the options of ``Figure``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -74,7 +74,7 @@ def show_plain_numbers(axis: Axis) -> None:
     from matplotlib.ticker import LogFormatter
 
     class PlainFormatter(LogFormatter):
-        """Matplotlib's choice of ticks, with 0.01 where it writes 1e-02."""
+        """Matplotlib's choice of ticks, with 0.01 instead of 1e-02."""
 
         def __call__(self, x: float, pos: int | None = None) -> str:
             return f"{x:g}" if super().__call__(x, pos) else ""
@@ -84,7 +84,7 @@ def show_plain_numbers(axis: Axis) -> None:
 
 
 def encode_figure(draw: Callable[[], Figure], kind: str = ".png", **options: Any) -> bytes:
-    """Draw a picture independently of the user's matplotlibrc: the same picture gives the same bytes."""
+    """Draw a picture independently of the user's matplotlibrc. The same picture gives the same bytes."""
     from matplotlib import style
 
     # dates, versions and random ids in the file would make equal pictures differ
@@ -97,17 +97,17 @@ def encode_figure(draw: Callable[[], Figure], kind: str = ".png", **options: Any
 
 
 def can_draw() -> bool:
-    """Whether matplotlib is installed."""
+    """True if matplotlib is installed."""
     return find_spec("matplotlib") is not None
 
 
 def save_figure(path: Path, draw: Callable[[], Figure], **options: Any) -> None:
     """Draw a picture independently of the user's matplotlibrc, and save it.
 
-    The file is written as a whole; an older one stays until then.
+    The file appears when it is complete, and an older file stays until then.
 
     Args:
-        path: The file; its ending gives its kind, PNG for other endings.
+        path: The file. Its ending gives its kind, with PNG for other endings.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -117,7 +117,7 @@ def save_figure(path: Path, draw: Callable[[], Figure], **options: Any) -> None:
 
 
 def save_bytes(path: Path, data: bytes) -> None:
-    """Save a picture that is drawn already, as a whole.
+    """Save an encoded picture as a whole.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -170,7 +170,7 @@ class Sheet:
 
     Attributes:
         site_in: Distance between neighbours, in inches.
-        extent: What each panel shows.
+        extent: The part of the lattice that each panel shows.
     """
 
     n_cols: int
@@ -192,13 +192,13 @@ class Sheet:
 
 
 def place_sites(sites: NDArray[np.generic], grid: SiteGrid) -> NDArray[np.float64]:
-    """Where sites are, on the grid or off it.
+    """Positions of sites, on the grid or off it.
 
     Args:
         sites: (..., 2), row and column.
 
     Returns:
-        float64 (..., 2), x and y in units of the spacing, from the site (0, 0); y down the image.
+        float64 (..., 2), x and y in units of the spacing, from the site (0, 0), y down the image.
 
     Example:
         >>> place_sites(np.array([[0, 3], [2, -1]]), SiteGrid(lattice="square")).tolist()
@@ -209,7 +209,7 @@ def place_sites(sites: NDArray[np.generic], grid: SiteGrid) -> NDArray[np.float6
 
 
 def extent_of_sites(others: NDArray[np.integer], grid: SiteGrid) -> Extent:
-    """The extent of all sites of the grid, and of others, int (n, 2), that may be outside of it."""
+    """The extent of all sites of the grid, and of other sites, int (n, 2), that may be outside it."""
     rows, cols = np.mgrid[: grid.n_rows : max(1, grid.n_rows - 1), : grid.n_cols : max(1, grid.n_cols - 1)]
     corners = np.stack([rows.ravel(), cols.ravel()], axis=1)
     places = place_sites(np.concatenate([corners, others]), grid)
@@ -258,7 +258,7 @@ class MarkerStyle:
         label: Its meaning, in the key.
         marker: matplotlib's name of the shape.
         size: Diameter, in units of the spacing.
-        face: Colour inside; "none" for a ring.
+        face: Colour inside, or "none" for a ring.
         edge: Colour of the rim.
     """
 
@@ -285,7 +285,7 @@ def neighbours(grid: SiteGrid) -> NDArray[np.int64]:
     """Steps to the nearest sites, in rows and columns, counter-clockwise as seen in a picture.
 
     Returns:
-        int64 (n, 2), 6 of them on a triangular lattice and 4 on a square one.
+        int64 (n, 2), 6 steps on a triangular lattice and 4 on a square lattice.
 
     Example:
         >>> neighbours(SiteGrid(lattice="square")).tolist()
@@ -312,7 +312,7 @@ def outline(sites: NDArray[np.bool_], grid: SiteGrid) -> Floats:
     """The border around some sites, bool (n_rows, n_cols).
 
     Returns:
-        float64 (n, 2, 2): start and end (x, y) of each stretch, in units of the spacing.
+        float64 (n, 2, 2), start and end (x, y) of each stretch, in units of the spacing.
 
     Example:
         >>> len(outline(np.array([[True, True]]), SiteGrid(1, 2)))
@@ -328,7 +328,7 @@ def outline(sites: NDArray[np.bool_], grid: SiteGrid) -> Floats:
 
 
 def _edges(grid: SiteGrid) -> Floats:
-    """The edge of a cell towards each neighbour, float64 (n, 2, 2); each begins where the last one ends."""
+    """The edge of a cell towards each neighbour, float64 (n, 2, 2). Each starts where the last ends."""
     to = place_sites(neighbours(grid), grid)
     aside = np.stack([-to[:, 1], to[:, 0]], axis=1)
     half = np.tan(np.pi / len(to)) / 2

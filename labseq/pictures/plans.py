@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 HEIGHT: Final = (0.28, 0.85)
 """Least and largest height of a hop, in units of the spacing."""
 STEP: Final = 0.17
-"""Height between lanes, in the same unit, while there is room for all of them."""
+"""Height between lanes, in units of the spacing, while there is room for all of them."""
 GAP: Final = 0.16
-"""Distance of an arrow's ends from the centres of its sites, in the same unit."""
+"""Distance of an arrow's ends from the centres of its sites, in units of the spacing."""
 HEAD: Final = (0.42, 0.2)
-"""Length and half width of an arrow's head, in the same unit."""
+"""Length and half width of an arrow's head, in units of the spacing."""
 
 N_POINTS: Final = 16
 
@@ -45,11 +45,11 @@ N_POINTS: Final = 16
 def lanes(moves: NDArray[np.integer]) -> NDArray[np.intp]:
     """Separate moves that overlap on a line, so that they can be drawn next to each other.
 
-    Short moves get the low lanes. Opposite moves along a line need no separate lanes:
-    they are drawn on opposite sides of it.
+    Short moves get the low lanes. Opposite moves along a line need no separate lanes, because they are drawn
+    on opposite sides of it.
 
     Args:
-        moves: (n, 4), from row, from column, to row, to column; each along a row or a column.
+        moves: (n, 4), from row, from column, to row, to column, each along a row or a column.
 
     Returns:
         The lane of each, from 0.
@@ -59,7 +59,7 @@ def lanes(moves: NDArray[np.integer]) -> NDArray[np.intp]:
         [1, 0, 0, 0]
     """
     way = moves[:, 2:] - moves[:, :2]
-    axis = (way[:, 0] != 0).astype(np.intp)  # 1 along a column, whose moves count rows
+    axis = (way[:, 0] != 0).astype(np.intp)  # 1 along a column, where moves count rows
     each = np.arange(len(moves))
     line, start, end = moves[each, axis], moves[each, 1 - axis], moves[each, 3 - axis]
     lane_of_move = np.zeros(len(moves), np.intp)
@@ -76,7 +76,7 @@ def lanes(moves: NDArray[np.integer]) -> NDArray[np.intp]:
 
 
 def heights(lane: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Heights of hops, in units of the spacing: lanes lie closer together if there are many.
+    """Heights of hops, in units of the spacing. Many lanes are closer together.
 
     Example:
         >>> heights(np.array([0, 1])).round(2).tolist()
@@ -90,14 +90,14 @@ def heights(lane: NDArray[np.intp]) -> NDArray[np.float64]:
 def hops(
     start: NDArray[np.float64], end: NDArray[np.float64], height: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Draw each arrow as a flat arc to the left of its way, so that opposite ways differ.
+    """Make each arrow a flat arc to the left of its way, so that opposite ways differ.
 
     The arc is a quadratic Bezier curve.
 
     Args:
         start: float64 (n, 2), in units of the spacing.
-        end: float64 (n, 2); no arrow may have length 0.
-        height: float64 (n,), in the same unit.
+        end: float64 (n, 2). No arrow may have length 0.
+        height: float64 (n,), in units of the spacing.
 
     Returns:
         The shafts, float64 (n, points, 2), and the heads, float64 (n, 3, 2).
@@ -133,7 +133,7 @@ Lines = tuple[Axis, tuple[int, ...]]
 def batch_lines(plan: Plan) -> list[Lines]:
     """The rows or the columns along which the atoms of each batch of a checked plan move.
 
-    Of a batch with paths of tones, the rows that its atoms come from.
+    For a batch with paths of tones, these are the rows that its atoms come from.
 
     Example:
         >>> batch_lines(Plan.from_batches([([(2, 0), (2, 1)], [(2, 3), (2, 4)])]))
@@ -150,13 +150,13 @@ def _lines_of(batch: Batch) -> Lines:
 
 
 def on_grid(sites: NDArray[np.integer], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which of some sites (n, 2) are on a grid with (n_rows, n_cols) sites, bool (n,)."""
+    """True for each site (n, 2) on a grid with (n_rows, n_cols) sites, bool (n,)."""
     inside = (sites >= 0) & (sites < shape)
     return inside[:, 0] & inside[:, 1]
 
 
 def occupancies(plan: Plan, occupancy: Occupancy) -> list[Occupancy]:
-    """The occupancy before each batch, and after the last: n_batches + 1 of them.
+    """The occupancy before each batch, and after the last, n_batches + 1 in all.
 
     Args:
         plan: A plan that was checked for this occupancy.
@@ -208,7 +208,7 @@ WRONG_LOOK: Final = MarkerStyle("refused", "D", 0.95, "none", DEFECT)
 def paint_sites(
     axes: Axes, sheet: Sheet, grid: SiteGrid, occupancy: Occupancy, target: TargetPattern, *, final: bool
 ) -> list[MarkerStyle]:
-    """Paint every site; ``final`` means that target sites that are empty stay empty.
+    """Paint every site. With ``final``, empty target sites stay empty.
 
     Returns:
         The markers that occur, in the order of the key.
@@ -249,7 +249,7 @@ def paint_moves(axes: Axes, sheet: Sheet, grid: SiteGrid, moves: NDArray[np.int1
 
 
 def paint_paths(axes: Axes, sheet: Sheet, grid: SiteGrid, batch: Batch, colour: Any) -> None:
-    """Paint the ways of all tweezers of a batch with paths of tones; those without an atom are dotted."""
+    """Paint the ways of all tweezers of a batch with paths of tones, dotted without an atom."""
     paths, points = batch.tones, sheet.site_in * POINTS_PER_INCH
     assert paths is not None
     thick = min(1.5, 0.11 * points)
@@ -281,7 +281,7 @@ def paint_lines(axes: Axes, sheet: Sheet, grid: SiteGrid, moves: NDArray[np.int1
 
 
 def paint_numbers(axes: Axes, grid: SiteGrid, colour: str = "0.4") -> None:
-    """Number rows on the left and columns at the top, every one or every fifth."""
+    """Number every row on the left and every column at the top, or every fifth."""
     rows = [(row, -1, row) for row in range(0, grid.n_rows, 1 if grid.n_rows < 10 else 5)]
     cols = [(-1, col, col) for col in range(0, grid.n_cols, 1 if grid.n_cols < 10 else 5)]
     for row, col, number in rows + cols:
@@ -302,7 +302,7 @@ def frame(axes: Axes, sheet: Sheet, title: str, edge: NDArray[np.float64]) -> No
 
 
 MAX_PANELS: Final = 38
-"""Maximum number of panels of batches; with those before and after that makes 40."""
+"""Maximum number of panels of batches. With the panels before and after there are 40."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,7 +311,7 @@ class Panel:
 
     Attributes:
         first: Index of the first batch.
-        last: Index of the last one.
+        last: Index of the last batch.
         moves_along: Their rows, their columns, or both.
     """
 
@@ -321,7 +321,7 @@ class Panel:
 
     @property
     def n_batches(self) -> int:
-        """How many batches."""
+        """Number of batches."""
         return self.last - self.first + 1
 
     @property
@@ -337,7 +337,7 @@ class Panel:
 
 
 def make_panels(batches: Sequence[Lines], max_panels: int = MAX_PANELS) -> list[Panel]:
-    """Distribute batches among panels, in order and evenly; each has its own if there are enough.
+    """Distribute batches among panels, in order and evenly, one per panel if there are enough panels.
 
     Example:
         >>> [(panel.first, panel.last) for panel in make_panels([("row", (i // 2,)) for i in range(8)], 4)]
@@ -348,7 +348,7 @@ def make_panels(batches: Sequence[Lines], max_panels: int = MAX_PANELS) -> list[
 
 
 def _short_label(axis: Axis, lines: tuple[int, ...]) -> str:
-    """The lines for a panel's title, which has room for 24 characters; more are only counted."""
+    """The lines for a panel's title, or only their number if they need more than 24 characters."""
     label = lines_label(axis, lines)
     return label if len(label) <= 24 else f"{len(lines)} {axis}s"
 
@@ -371,7 +371,7 @@ COLOURS: Final = ("plasma", 0.0, 0.82)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanDrawing:
-    """What is drawn: a plan, the occupancy before it, two lines of text at the top, and a refusal."""
+    """A plan to draw, the occupancy before it, two lines of text at the top, and a refusal."""
 
     title: str
     source: str
@@ -384,7 +384,7 @@ class PlanDrawing:
 
     @property
     def refused_batch(self) -> Batch | None:
-        """The batch that breaks a rule, with sites far outside of the grid moved closer to it."""
+        """The batch that breaks a rule, with sites far outside the grid moved closer to it."""
         if self.refused is None:
             return None
         batch, most = self.plan.batch(self.refused.batch), np.array(self.grid.shape) + 1
@@ -398,8 +398,8 @@ def check_picture(path: Path, shape: tuple[int, int]) -> None:
     """Check that a picture of (n_rows, n_cols) sites can be drawn and saved, before anything is planned.
 
     Raises:
-        ConfigError: The file has another ending than .png, its folder does not
-            exist, the array is too large, or matplotlib is not installed.
+        ConfigError: The name does not end in .png, its folder does not exist, the array is too large, or
+            matplotlib is not installed.
     """
     check_size(path, shape)
     check_place(path, (".png",))
@@ -417,7 +417,7 @@ def check_size(path: Path, shape: tuple[int, int]) -> None:
 
 
 def save_plan(path: Path, drawing: PlanDrawing) -> None:
-    """Draw the array before and after, and between them a panel for each batch or some of them.
+    """Draw the array before and after, and in between a panel for each batch or group of batches.
 
     A refused plan is drawn up to the refused batch, with its mistake.
 
@@ -452,7 +452,7 @@ def _draw(drawing: PlanDrawing) -> Figure:
 
 
 def _fill(figure: Figure, sheet: Sheet, drawing: PlanDrawing, panels: list[Panel]) -> list[MarkerStyle]:
-    """Paint all panels of valid batches; return the marks that the key explains."""
+    """Paint all panels of valid batches, and return the markers for the key."""
     grid, target, refused = drawing.grid, drawing.target, drawing.refused
     before = occupancies(drawing.plan, drawing.occupancy)
     shown = [before[0], *(before[panel.first] for panel in panels), before[-1]]
@@ -496,7 +496,7 @@ def _paint_refused(
         np.arange(len(moves)) == error.move if error.move >= 0 else np.full(len(moves), error.site is None)
     )
     goes = (batch.from_sites != batch.to_sites).any(axis=1)
-    colours = np.where(wrong, DEFECT, "0.25")  # grey: moves that break no rule themselves
+    colours = np.where(wrong, DEFECT, "0.25")  # moves that break no rule are grey
     paint_moves(axes, sheet, grid, moves[goes], colours[goes])
     sites = moves[wrong & ~goes, :2] if error.site is None else np.array([error.site])
     x, y = place_sites(np.clip(sites, -2, np.array(grid.shape) + 1), grid).T

@@ -1,4 +1,4 @@
-"""Where the tweezers and the atoms of a plan are at any time, for animations."""
+"""Computes the places of the tweezers and atoms of a plan at any time, for animations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Knot = tuple[float, float, float]
 Fate = Literal["kept", "ejected", "lost", "missing"]
 
 SITE_0_HZ, SITE_HZ = 1e9, 1e6
-"""Frequency of the tone of site 0, and from site to site, in the programs that places are read from."""
+"""Frequency of site 0 and step from site to site, in the programs that places are read from."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,9 +42,9 @@ class AtomTrack:
     """The way of one atom.
 
     Attributes:
-        knots: float64 (n, 3), time in s, row, column; straight between knots, at rest before and after them.
+        knots: float64 (n, 3), time in s, row, column. Straight between knots, at rest before and after them.
         fate: "kept", "ejected" beyond the grid, "lost" at a known time, or "missing" on the next image.
-        end_s: When it was ejected or lost, the end of the motion for a missing atom; inf if it is kept.
+        end_s: When it was ejected or lost, the end of the motion for a missing atom, or inf if it is kept.
     """
 
     knots: Floats
@@ -53,7 +53,7 @@ class AtomTrack:
 
     @property
     def is_lost(self) -> bool:
-        """Whether it is lost at any time, known or not."""
+        """True if it is lost at any time, known or not."""
         return self.fate in ("lost", "missing")
 
     def ended(self, fate: Fate, end_s: float) -> AtomTrack:
@@ -67,7 +67,7 @@ class AtomTrack:
 
 
 def place_at(knots: Floats, t_s: float) -> Floats:
-    """The values of knots (n, 1 + m), whose first column is the time, at a time: float64 (m,).
+    """The values of knots (n, 1 + m), whose first column is the time, at a time, float64 (m,).
 
     Example:
         >>> place_at(np.array([[0.0, 1.0, 5.0], [2.0, 3.0, 5.0]]), 0.5).tolist()
@@ -83,11 +83,11 @@ class Frame:
     """Everything at one time, in sites.
 
     Attributes:
-        batch: Index of the batch that is played, or played next; after the end the number of batches.
+        batch: Index of the batch that is played, or played next. After the end the number of batches.
         rows: float64 (n, 2), place and depth of each row tone that is on.
         columns: float64 (n, 2), the same for the column tones.
         atoms: float64 (n_atoms, 2), row and column of each atom.
-        is_there: bool (n_atoms,), whether an atom is neither ejected nor lost yet.
+        is_there: bool (n_atoms,), True for an atom that is not ejected or lost yet.
     """
 
     batch: int
@@ -98,7 +98,7 @@ class Frame:
 
     @property
     def tweezers(self) -> Floats:
-        """The crossings of the tones, float64 (n, 4): row, column, depth, and 1 for those with an atom."""
+        """The crossings of the tones, float64 (n, 4) of row, column, depth, and 1 with an atom."""
         atoms = {tuple(place) for place in self.atoms[self.is_there].round(6).tolist()}
         crossings = [
             (row, column, deep * depth, float((round(row, 6), round(column, 6)) in atoms))
@@ -115,11 +115,11 @@ class Playback:
     Attributes:
         grid: The grid of sites.
         target: The target.
-        start_s: Start of the first batch: the time before it belongs to the plan, the tones, the transfer.
+        start_s: Start of the first batch, after the time for the plan, the tones and the transfer.
         end_s: End of the last batch.
         batch_s: float64 (n_batches, 2), start and end of each batch.
-        rows: The tones of the rows while they are on: for each float64 (n, 3) of time, place in sites and
-            depth relative to the full one; straight between these knots.
+        rows: The tones of the rows while they are on. Each is float64 (n, 3) of time, place in sites and
+            depth relative to full depth. Straight between these knots.
         columns: The same for the tones of the columns.
         atoms: The atoms.
     """
@@ -134,7 +134,7 @@ class Playback:
     atoms: tuple[AtomTrack, ...]
 
     def at(self, t_s: float) -> Frame:
-        """Where everything is at a time."""
+        """The place of everything at a time."""
         return Frame(
             batch=self.at_batch(t_s),
             rows=_on(self.rows, t_s),
@@ -145,13 +145,13 @@ class Playback:
 
     @property
     def speed(self) -> float:
-        """Motion that is shown in a second, in seconds: 1, 2 or 5 times a power of ten, at least 0.1 ms."""
+        """Motion shown in a second, in seconds. 1, 2 or 5 times a power of ten, at least 0.1 ms."""
         steps = (factor * 10.0**power for power in range(-4, -1) for factor in (1, 2, 5))
-        # longest time that an animation takes, except of motion that takes longer than a second
+        # longest animation, except of motion that takes longer than a second
         return next((step for step in steps if self.end_s - self.start_s <= 20.0 * step), 0.05)
 
     def trails(self, t_s: float) -> list[Floats]:
-        """The ways of the atoms in the batch that is played, until a time: float64 (n, 2) each, in sites."""
+        """The ways of the atoms in the batch that is played, until a time, float64 (n, 2) each, in sites."""
         batch = self.at_batch(t_s)
         since_s = self.batch_s[batch, 0] if batch < len(self.batch_s) else math.inf
         passed = [
@@ -161,11 +161,11 @@ class Playback:
         return [np.vstack([places, atom.place(t_s)]) for atom, places in passed if len(places)]
 
     def at_batch(self, t_s: float) -> int:
-        """Index of the batch that is played, or played next; after the end the number of batches."""
+        """Index of the batch that is played, or played next. After the end the number of batches."""
         return int(np.searchsorted(self.batch_s[:, 1], t_s, side="right"))
 
     def as_json(self) -> dict[str, Any]:
-        """Everything that ``player.js`` needs to draw it at any time; times in ms."""
+        """Everything that ``player.js`` needs to draw it at any time, with times in ms."""
         return {
             "n_rows": self.grid.n_rows,
             "n_cols": self.grid.n_cols,
@@ -203,10 +203,10 @@ def play_back(
     motion: MotionSpec,
     end_s: float,
 ) -> Playback:
-    """Work out where tweezers and atoms are while a checked plan is played.
+    """Compute the places of tweezers and atoms while a checked plan is played.
 
     Atoms on which a tweezer without an atom is ramped down are lost at the end of its batch if the profile's
-    ``losses.landing`` is more than half. No other loss can be foreseen for a single atom.
+    ``losses.landing`` is more than half. No other loss of a single atom can be predicted.
 
     Args:
         plan: The batches that are played.
@@ -221,7 +221,7 @@ def play_back(
     on = program.kind != SegmentKind.IDLE
     segments = [np.flatnonzero(on & (program.batch == batch)) for batch in range(plan.n_batches)]
     batch_s = [(joint_s[own[0]], joint_s[own[-1] + 1]) for own in segments]
-    depths = motion.max_row_tones**2, motion.max_column_tones**2  # relative to an equal share of each tone
+    depths = motion.max_row_tones**2, motion.max_column_tones**2  # relative to an equal share for each tone
     return Playback(
         grid=grid,
         target=target,
@@ -251,7 +251,7 @@ def _places(axis: AxisTones, segment: int) -> Floats:
 
 
 def _pieces(program: ToneProgram, segment: int, joint_s: Floats) -> Iterator[tuple[float, float, float]]:
-    """Knots of a segment: time, and the fractions of its duration and of the ways that have passed."""
+    """Time of each knot of a segment, and fractions of its duration and its ways until then."""
     course = FrequencyCourse(int(program.course[segment]))
     first_s, last_s = joint_s[segment : segment + 2].tolist()
     # 12 straight pieces for a segment in which the speed changes
@@ -262,9 +262,9 @@ def _pieces(program: ToneProgram, segment: int, joint_s: Floats) -> Iterator[tup
 def _tone_tracks(
     program: ToneProgram, axis: AxisTones, joint_s: Floats, full_depth: float
 ) -> tuple[Floats, ...]:
-    """Each tone of an axis from where it comes on to where it goes off."""
+    """Each tone of an axis from its switching on to its switching off."""
     tracks: list[list[Knot]] = []
-    on: dict[float, list[Knot]] = {}  # place where a tone is now -> its knots
+    on: dict[float, list[Knot]] = {}  # knots of each tone, by its place now
     for segment in range(program.n_segments):
         part = slice(axis.offsets[segment], axis.offsets[segment + 1])
         amplitudes = np.stack([axis.start_amplitude[part], axis.end_amplitude[part]], axis=1)
@@ -282,7 +282,7 @@ def _tone_tracks(
 
 
 def _add(track: list[Knot], knot: Knot) -> None:
-    """Add a knot, in place of the last one where nothing has changed since the one before."""
+    """Add a knot, which replaces the last knot if nothing has changed since the knot before it."""
     if len(track) > 1 and track[-1][1:] == track[-2][1:] == knot[1:]:
         track[-1] = knot
     elif not track or track[-1] != knot:
@@ -297,7 +297,7 @@ def _atom_tracks(
     occupancy: Occupancy,
     motion: MotionSpec,
 ) -> tuple[AtomTrack, ...]:
-    """The way of each atom: with the tones that cross on it while its batch is played."""
+    """The way of each atom, which follows the tones that cross on it while its batch is played."""
     homes = np.argwhere(occupancy)
     tracks: list[list[Knot]] = [[(float(joint_s[0]), float(row), float(col))] for row, col in homes.tolist()]
     on_site = np.full(occupancy.shape, -1)
@@ -320,7 +320,7 @@ def _atom_tracks(
 
 
 def _carry(tracks: list[list[Knot]], program: ToneProgram, segment: int, joint_s: Floats) -> None:
-    """Carry on the ways of atoms by a segment; those whose tones are off already stay where they are."""
+    """Continue the ways of atoms by a segment. Atoms whose tones are already off stay at rest."""
     rows, columns = (dict(_places(axis, segment).tolist()) for axis in (program.row, program.column))
     pieces = list(_pieces(program, segment, joint_s))
     for track in tracks:
@@ -332,7 +332,7 @@ def _carry(tracks: list[list[Knot]], program: ToneProgram, segment: int, joint_s
 
 
 def play_back_cycle(shot: Shot, index: int) -> Playback:
-    """Work out where tweezers and atoms were in a cycle of a recorded shot, and which atoms were lost.
+    """Compute the places of tweezers and atoms in a cycle of a recorded shot, and which atoms were lost.
 
     Args:
         shot: The shot.
@@ -363,7 +363,7 @@ def play_back_cycle(shot: Shot, index: int) -> Playback:
 
 
 def _true_atoms(shot: Shot, image: int) -> Occupancy | None:
-    """The atoms that were there when an image was taken, if a simulation recorded them."""
+    """The atoms present when an image was taken, if a simulation recorded them."""
     atoms = shot.atom_events.get("atoms")
     if atoms is None:
         return None
@@ -375,7 +375,7 @@ def _true_atoms(shot: Shot, image: int) -> Occupancy | None:
 def _with_losses(
     shot: Shot, cycle_start_s: float, playback: Playback, seen: Occupancy
 ) -> Iterator[AtomTrack]:
-    """The atoms, with those that are not where they should be as missing, or as lost where that is known."""
+    """The atoms, where an atom that is not in its place is missing, or lost if this is known."""
     flights = shot.atom_events.get("flights")
     losses = np.empty((0, 3))
     if flights is not None:
@@ -395,5 +395,5 @@ def _with_losses(
 
 
 def _is_near(place: Floats, other: Iterable[float]) -> bool:
-    """Whether two places are less than 0.6 sites apart, so that no two atoms are near the same place."""
+    """True if two places are less than 0.6 sites apart, so no two atoms are near the same place."""
     return bool(np.abs(place - np.array([*other])).max() < 0.6)

@@ -1,4 +1,4 @@
-"""Pictures of targets, and targets as text."""
+"""Draws targets, and writes them as text."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ FILL_LOOK: Final = MarkerStyle("atom", "o", 0.76, "#1b5e8c", "#1b5e8c")
 
 
 def draw_target(axes: Axes, target: TargetPattern, grid: SiteGrid, site_in: float = SITE_IN) -> None:
-    """Draw a target: atoms filled, sites that must be empty as rings, the reservoir as dots.
+    """Draw a target with filled atoms, rings for sites that must be empty, and dots for the reservoir.
 
     Args:
-        axes: Where to draw; their limits show the whole grid, and their frame is hidden.
-        grid: The grid that it lies on.
+        axes: Axes to draw on. Their limits show the whole grid, and their frame is hidden.
+        grid: The grid of the target.
         site_in: Distance between neighbours in the finished picture, in inches.
 
     Raises:
         ValueError: Target and grid differ in shape.
     """
     if target.shape != grid.shape:
-        raise ValueError(f"the target has {target.shape} sites and the grid {grid.shape}; expected the same")
+        raise ValueError(f"the target has {target.shape} sites but the grid {grid.shape}; expected the same")
     for look, sites in (
         (MarkerStyle("reservoir", "o", 0.16, "0.6", "0.6"), ~target.fill & ~target.clear),
         (MarkerStyle("must be empty", "o", 0.34, "white", "0.78"), target.clear),
@@ -66,7 +66,7 @@ def save_target(path: Path, target: TargetPattern, grid: SiteGrid) -> None:
 
 
 def target_text(target: TargetPattern) -> str:
-    r"""A target as text, one line per row: "#" an atom, "o" must be empty, "." reservoir.
+    r"""A target as text, one line per row, with "#" for an atom, "o" for must be empty, "." for reservoir.
 
     Example:
         >>> fill = np.array([[True, False, False]])

@@ -1,1 +1,1 @@
-"""`labseq plan` and `labseq waveform`: one plan, and what the AWG plays for it, printed, drawn and saved."""
+"""`labseq plan` and `labseq waveform`, which print, draw and save a plan and its AWG output."""

@@ -18,7 +18,7 @@ from labseq.motion.axes import AXES, AxisIndex
 from labseq.motion.rendering import FULL_SCALE, Renderer, RenderPath
 
 CHUNK: Final = 1 << 18
-"""Samples per chunk of the analysis: 2 MB in float64."""
+"""Samples per chunk of the analysis (2 MB in float64)."""
 
 BOTH: Final[tuple[AxisIndex, AxisIndex]] = (0, 1)
 PATHS: Final = (RenderPath.COMB, RenderPath.BLENDED, RenderPath.DIRECT)
@@ -37,15 +37,15 @@ class AxisStatistics:
         snapped_m: Maximum distance by which a tone was moved onto a comb, in the atom plane.
         peak_v: Highest voltage of a sample, across 50 Ohm, as full scale is given.
         peak_batch: Index of the batch with this sample.
-        crest_factor: Highest peak over r.m.s. of the samples of a segment of transport, where
-            nothing is ramped; None if all are 0.
+        crest_factor: Highest ratio of peak to r.m.s. of the samples of a transport segment, where nothing is
+            ramped. None if all are 0.
         crest_batch: Index of the batch with this crest factor.
         mean_power_w: Mean power into 50 Ohm while tones are on.
         highest_power_w: Highest short-term mean power, from the tones' amplitudes.
         aod_peak_v: Highest voltage after the amplifier, across 50 Ohm.
         aod_mean_power_w: Mean power at the AOD while tones are on.
         aod_highest_power_w: Highest short-term mean power at the AOD.
-        path_share: Name of each render path -> its share of the samples with tones on.
+        path_share: Share of each render path in the samples with tones on, by name.
     """
 
     name: str
@@ -74,7 +74,7 @@ def measure_axes(
     Args:
         program: The tone program.
         renderer: The renderer.
-        segments: Indices of its segments; at least one has tones.
+        segments: Indices of its segments. At least one has tones.
         grid: The grid of sites of the program.
         motion: How the tweezers move.
 
@@ -93,7 +93,7 @@ def measure_axes(
         peak_v = float(volts * peaks[loudest])
         mean_power_w = float(volts**2 * energies.sum() / n_samples.sum() / LOAD_OHM)
         highest_power_w = _highest_power_w(tones, segments, rf)
-        gain = 10 ** (rf.amplifier_gain_db / 10)  # of power, so that a voltage gains its square root
+        gain = 10 ** (rf.amplifier_gain_db / 10)  # of power, and its square root is the gain of voltage
         paths = {path.name.lower(): n_samples[renderer.path[axis, on] == path].sum() for path in PATHS}
         return AxisStatistics(
             name=AXES[axis],
@@ -136,14 +136,14 @@ def _scan(
 
 
 def _highest_power_w(tones: AxisTones, segments: range, rf: RfSpec) -> float:
-    """The highest power of the tones together, which changes linearly in a segment."""
+    """The highest total power of the tones, which changes linearly in a segment."""
     squares = np.cumsum(np.square([tones.start_amplitude, tones.end_amplitude]), axis=1)
     sums = np.diff(np.concatenate([np.zeros((2, 1)), squares], axis=1)[:, tones.offsets], axis=1)
     return rf.full_scale_v**2 / (2 * LOAD_OHM) * float(sums[:, segments.start : segments.stop].max())
 
 
 def _tone_statistics(tones: AxisTones, segments: range) -> dict[str, Any]:
-    """Frequencies, and highest sum of amplitudes."""
+    """Frequencies and highest sum of amplitudes."""
     from labseq.motion.tone_kernels import greatest_sum
 
     part = slice(tones.offsets[segments.start], tones.offsets[segments.stop])

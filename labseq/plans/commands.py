@@ -26,7 +26,7 @@ Target = Annotated[
     str | None,
     typer.Option(
         metavar="PATTERN|SEQUENCE",
-        help="The target: a pattern as in a sequence file, '{pattern: kagome, rows: 15, cols: 15}', or the "
+        help="The target, as in a sequence file, '{pattern: kagome, rows: 15, cols: 15}', or the "
         "file or name of a sequence whose target is used. Default: the target that the shot was taken with.",
     ),
 ]
@@ -35,7 +35,7 @@ Dop = Annotated[
     int | None,
     typer.Option(
         metavar="N",
-        help="Degree of parallelism: maximum number of mobile tweezers on at once. Default: the planner's.",
+        help="Degree of parallelism (most mobile tweezers on at once). Default: the planner's.",
     ),
 ]
 Seed = Annotated[
@@ -49,8 +49,8 @@ Origin = Annotated[
 Profile = Annotated[
     str | None,
     profile_option(
-        "Hardware profile with the grid, the motion and the plugin folders. Default: those of the shot "
-        "file, else the paper's spacing and motion."
+        "Hardware profile with the grid, the motion and the plugin folders. Default: the shot file's, "
+        "else the paper's spacing and motion."
     ),
 ]
 Overrides = Annotated[
@@ -59,7 +59,7 @@ Overrides = Annotated[
         "--set",
         metavar="KEY=VALUE",
         help="Change a setting of the planner, or with profile.mobile_tweezers.speed=... a value of the "
-        "profile; may be given several times.",
+        "profile. May be given several times.",
     ),
 ]
 
@@ -69,11 +69,10 @@ def plan(
         str,
         typer.Argument(
             metavar="OCCUPANCY",
-            help="A text file of 0 and 1, or '-' for such a text on standard input; a .npy file, or an array "
-            "of a .npz or HDF5 file, such as loadings.h5:loaded#3 (of several occupancies the one with "
-            "index 3, counted from 0); the shot file run/shots/shot_000003.h5#2 (the image that cycle 2 was "
-            "planned on, counted from 0; default: 0); or random:20x20@0.75 (each site filled with that "
-            "probability).",
+            help="A text file of 0 and 1, or '-' for text on standard input. Or a .npy file, or an array "
+            "of a .npz or HDF5 file, such as loadings.h5:loaded#3 (occupancy 3 of several, counted from 0). "
+            "Or a shot file such as run/shots/shot_000003.h5#2 (the image that cycle 2 was planned on, "
+            "counted from 0, default 0). Or random:20x20@0.75 (each site filled with this probability).",
             show_default=False,
         ),
     ],
@@ -85,7 +84,7 @@ def plan(
     profile: Profile = None,
     overrides: Overrides = None,
     step: Annotated[
-        bool, typer.Option("--step", help="Show batch by batch; in a terminal, wait for Enter after each.")
+        bool, typer.Option("--step", help="Show batch by batch. In a terminal, wait for Enter after each.")
     ] = False,
     json: JsonFile = None,
     png: Annotated[
@@ -95,8 +94,7 @@ def plan(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Show tweezers and atoms in time, as they are played: a GIF, or a page (.html) for a "
-            "browser.",
+            help="Show the motion of tweezers and atoms in time, as a GIF or a page (.html) for a browser.",
         ),
     ] = None,
     _plugins: Plugins = None,
@@ -117,7 +115,7 @@ def waveform(
         str,
         typer.Argument(
             metavar="PLAN|OCCUPANCY",
-            help="What 'labseq plan --json' wrote: a file that ends in .json, or '-' for standard input; or "
+            help="The output of 'labseq plan --json', as a .json file, or '-' for standard input. Or "
             "any OCCUPANCY of 'labseq plan', which is then planned.",
             show_default=False,
         ),
@@ -154,7 +152,7 @@ def waveform(
     ] = None,
     _plugins: Plugins = None,
 ) -> None:
-    """Show what the AWG would play for a plan: voltages, powers, spectrogram, samples."""
+    """Show voltages, powers, spectrogram and samples that the AWG would play for a plan."""
     from labseq.assembly.planning import PlanRequest
     from labseq.plans.waveform import WaveformRequest
     from labseq.plans.waveform_report import WaveformOutput, show_waveform

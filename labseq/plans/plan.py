@@ -1,4 +1,4 @@
-"""`labseq plan`: prints or draws the moves for one occupancy."""
+"""`labseq plan` prints or draws the moves for one occupancy."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class PlanOutput:
     """The output to print and write.
 
     Attributes:
-        step: Whether to print the plan batch by batch.
-        json: Name of the file for the plan as JSON; "-" for stdout, which then holds nothing else.
+        step: True to print the plan batch by batch.
+        json: Name of the file for the plan as JSON, or "-" for stdout, which then holds nothing else.
         png: The file for the plan as a picture.
         animate: The file for the plan as an animation.
     """
@@ -73,7 +73,7 @@ def plan_once(request: PlanRequest, output: PlanOutput) -> None:
 
 
 def warnings(moves: PlannedMoves, request: PlanRequest) -> list[str]:
-    """Warnings for the user about a valid plan; none of a refused one."""
+    """Warnings for the user about a valid plan. A refused plan has none."""
     if moves.refused is not None:
         return []
     texts: list[str] = []
@@ -106,7 +106,7 @@ def _draw(moves: PlannedMoves, path: Path) -> None:
 
 
 def _animate(moves: PlannedMoves, path: Path) -> None:
-    """Save the motion; of a refused plan, that of the batches before the refused one."""
+    """Save the motion, which ends before the refused batch if the plan is refused."""
     from labseq.pictures.animations import Animation, save_animation
     from labseq.pictures.playback import play_back
 
@@ -117,7 +117,7 @@ def _animate(moves: PlannedMoves, path: Path) -> None:
 
 
 def batch_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> Iterator[list[Text]]:
-    """Describe and draw each batch; of a refused plan, those before the refused one."""
+    """Describe and draw each batch, up to the refused batch of a refused plan."""
     plan, report, shape = moves.plan, moves.report, moves.grid.shape
     arrays = occupancies(plan, moves.occupancy)
     for i, batch in enumerate(plan.batches[: len(report.batch_end_s)]):
@@ -139,7 +139,7 @@ def batch_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> Iterator[
 
 
 def refused_lines(moves: PlannedMoves, canvas: ArrayPair, arrow: str) -> list[Text]:
-    """Describe and draw the refused batch and the place of its mistake; nothing for a valid plan."""
+    """Describe and draw the refused batch and the place of its mistake. Empty for a valid plan."""
     error, plan, shape = moves.refused, moves.plan, moves.grid.shape
     if error is None:
         return []
@@ -188,7 +188,7 @@ def moves_text(batch: Batch, shape: tuple[int, int], arrow: str = "->") -> list[
 
 
 def _paths_text(batch: Batch, paths: TonePaths, shape: tuple[int, int], arrow: str) -> list[str]:
-    """Where the tones of each axis go and in how many legs, and which atoms move."""
+    """Ways of the tones of each axis, the number of legs, and the atoms that move."""
     lines: list[str] = []
     for name, path, off in (("rows", paths.row, paths.row_off), ("columns", paths.column, paths.column_off)):
         ends = path[off, np.arange(len(off))]
@@ -210,7 +210,7 @@ class _Console(Console):
 
 
 def print_plan(moves: PlannedMoves, stream: TextIO, *, step: bool) -> None:
-    """Print a plan; with ``step`` batch by batch, in a terminal waiting for Enter after each."""
+    """Print a plan, with ``step`` batch by batch, waiting for Enter after each in a terminal."""
     console = _Console(file=stream, highlight=False, soft_wrap=True)
     with writing_to(stream):
         _print_all(console, moves, step=step)
@@ -242,7 +242,7 @@ def _print_steps(console: Console, steps: Iterable[list[Text]]) -> None:
 
 
 def _wait_for_enter(console: Console) -> bool:
-    """Wait for Enter; False for "q" or the end of the input."""
+    """Wait for Enter. False for "q" or the end of the input."""
     console.print(Text("Enter: next batch, q: skip the rest ", "dim"), end="")
     answer = sys.stdin.readline()
     console.print()
@@ -288,12 +288,12 @@ def subject(moves: PlannedMoves) -> Facts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanReport:
-    """A plan, SI, as :mod:`labseq.plans.plan_file` reads it; occupancies as rows of 0 and 1.
+    """A plan in SI units as :mod:`labseq.plans.plan_file` reads it, with occupancies as rows of 0 and 1.
 
     Attributes:
         planner: Name of the planner.
-        degree_of_parallelism: Maximum number of tweezers on at once, which the plan was checked for.
-        seed: Seed of all random numbers; None if there is none.
+        degree_of_parallelism: Maximum number of tweezers on at once in the check of the plan.
+        seed: Seed of all random numbers, or None.
         grid: Size, spacing and lattice of the grid.
         occupancy: Before the plan.
         target: "fill", sites to hold an atom, and "clear", sites to be empty.
@@ -304,10 +304,10 @@ class PlanReport:
         n_ejected: Atoms that leave the grid.
         n_filled: Sites of the target that hold an atom after the plan.
         n_surplus: Atoms that are left on sites to be empty.
-        survival: What the plan costs, by the losses of the profile.
-        choice: What the planner chose for the target, then the alternatives.
-        batches: The batches; the sites of ejected atoms are off the grid.
-        predicted: The occupancy after the plan; of a refused plan, after the batches before the refused one.
+        survival: Predicted cost of the plan, from the losses of the profile.
+        choice: The planner's choice for the target, then the alternatives.
+        batches: The batches. The sites of ejected atoms are off the grid.
+        predicted: The occupancy after the plan, or before the refused batch.
         refused: The rule that the plan breaks, if it does.
     """
 
@@ -359,7 +359,7 @@ class PlanReport:
     def totals(self) -> Facts:
         """The plan in numbers."""
         if self.refused is not None:
-            valid = f"{self.n_batches}, of which {self.refused.batch} come before the refused one"
+            valid = f"{self.n_batches}, {self.refused.batch} before the refused batch"
             return [("batches", valid), ("atom moves", str(self.n_atom_moves))]
         lost = f"{self.survival.n_lost:.2g} atoms expected until the next image"
         defect_free = percent(self.survival.p_defect_free, 1)
@@ -370,7 +370,7 @@ class PlanReport:
             ("duration", format_quantity(self.duration_s, "time")),
             ("tweezers", f"at most {self.max_tweezers} on at once"),
             ("ejected", plural(self.n_ejected, "atom")),
-            *([("lost", f"{lost}; defect-free then: {defect_free}")] if self.n_batches else []),
+            *([("lost", f"{lost}, defect-free {defect_free}")] if self.n_batches else []),
             ("filled", f"{count_of(self.n_filled, int(self.target['fill'].sum()))} target sites"),
             *([("surplus", surplus)] if self.n_surplus else []),
         ]
@@ -378,7 +378,7 @@ class PlanReport:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a plan is refused: the batch and the atom move in it, -1 for no particular one."""
+    """Why a plan is refused, with the batch and the atom move, or -1 for none in particular."""
 
     batch: int
     move: int

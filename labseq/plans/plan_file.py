@@ -24,14 +24,14 @@ from labseq.settings import Name, Settings, setting_error
 from labseq.text_files import decode
 
 MAX_BYTES: Final = 4 << 20
-"""Maximum size of a plan, in bytes: that of one for 500 x 500 sites."""
+"""Maximum size of a plan, in bytes, enough for 500 x 500 sites."""
 
 _EXPECTED: Final = "what 'labseq plan --json' writes"
 
 Bit: TypeAlias = Annotated[int, Field(ge=0, le=1)]
 Rows: TypeAlias = tuple[tuple[Bit, ...], ...]
 Index: TypeAlias = Annotated[int, Field(ge=-1000, le=2000)]
-"""Index of a row or column; an ejected atom ends off the grid."""
+"""Index of a row or column. An ejected atom ends off the grid."""
 
 
 class GridFile(Settings):
@@ -64,9 +64,9 @@ Knots: TypeAlias = tuple[Annotated[int, Field(ge=1, le=100_000)], ...]
 
 
 class PathsFile(Settings):
-    """Where the tones of a batch go."""
+    """Paths of the tones of a batch."""
 
-    row: Path = Field(description="position of each row tone, in sites, at the first knot, at the next, ...")
+    row: Path = Field(description="positions of the row tones, in sites, at each knot")
     column: Path = Field(description="the same for the column tones")
     row_off: Knots = Field(description="knot at which each row tone goes off, from 0")
     column_off: Knots = Field(description="the same for the column tones")
@@ -91,7 +91,7 @@ class BatchFile(Settings):
         alias="from", description="[row, column] of each atom"
     )
     to_sites: tuple[tuple[Index, Index], ...] = Field(alias="to", description="[row, column] of each goal")
-    linked: bool = Field(default=False, description="whether the tweezers stay on from the batch before")
+    linked: bool = Field(default=False, description="true if the tweezers stay on from the batch before")
     tones: PathsFile | None = Field(
         default=None, description="paths of the tones, where rows and columns move at once"
     )
@@ -99,10 +99,10 @@ class BatchFile(Settings):
     @model_validator(mode="after")
     def _has_a_goal_for_each_atom(self) -> Self:
         if len(self.from_sites) != len(self.to_sites):
-            what = f"'from' has {len(self.from_sites)} sites, 'to' has {len(self.to_sites)}"
-            raise setting_error(what, "as many of both")
+            what = f"'from' has {len(self.from_sites)} sites, but 'to' has {len(self.to_sites)}"
+            raise setting_error(what, "the same number")
         if self.linked and self.tones is not None:
-            raise setting_error("a batch with 'tones' is linked", "only line batches are")
+            raise setting_error("a batch with 'tones' is linked", "linked line batches only")
         return self
 
     def model(self) -> Batch:
@@ -114,16 +114,14 @@ class BatchFile(Settings):
 
 
 class _File(Settings):
-    """The keys of a plan's file; derived values in it are ignored."""
+    """The keys of a plan's file. Derived values in it are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
     planner: Name = Field(description="name of the planner")
-    grid: GridFile = Field(description="the sites that it is for")
+    grid: GridFile = Field(description="the sites that the plan is for")
     degree_of_parallelism: int = Field(ge=1, le=1_000_000, description="most mobile tweezers on at once")
-    seed: int | None = Field(
-        default=None, ge=0, description="seed of all random numbers; null if there were none"
-    )
+    seed: int | None = Field(default=None, ge=0, description="seed of all random numbers, or null")
     occupancy: Rows = Field(description="before the plan, rows of 0 and 1")
     target: TargetFile = Field(description="the pattern of atoms to reach")
     batches: tuple[BatchFile, ...] = Field(description="the batches")
@@ -131,12 +129,12 @@ class _File(Settings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanFile:
-    """A plan and its inputs, as read from a file; the plan is not checked yet.
+    """A plan and its inputs, as read from a file. The plan is not checked yet.
 
     Attributes:
         planner: Name of the planner.
         degree_of_parallelism: Maximum number of tweezers on at once that the planner was allowed.
-        seed: Seed of all random numbers; None if there were none.
+        seed: Seed of all random numbers, or None.
         grid: The grid of sites, with the tones that a grid of its size has by default.
         occupancy: bool (n_rows, n_cols), before the plan.
         target: The pattern of atoms to reach.
@@ -159,7 +157,8 @@ def parse_plan(data: bytes, name: str) -> PlanFile:
         data: UTF-8.
 
     Raises:
-        ConfigError: It is not JSON, not a plan, or a value in it is invalid; says what was expected.
+        ConfigError: It is not JSON, not a plan, or a value in it is invalid. The message says what was
+            expected.
     """
     if len(data) > MAX_BYTES:
         raise ConfigError(Problem(f"it is larger than {MAX_BYTES >> 20} MiB", name, expected=_EXPECTED))
@@ -198,7 +197,7 @@ def _target(target: TargetFile, shape: tuple[int, int], name: str) -> TargetPatt
 def _bits(rows: Rows, key: str, shape: tuple[int, int], name: str) -> NDArray[np.bool_]:
     if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
         expected = f"{shape[0]} rows of {shape[1]} sites, as in 'grid'"
-        raise ConfigError(Problem(f"'{key}' is not of the grid's shape", name, expected=expected))
+        raise ConfigError(Problem(f"'{key}' does not have the grid's shape", name, expected=expected))
     return np.array(rows, np.bool_)
 
 
@@ -212,14 +211,14 @@ def read_plan(
     """Read the JSON of a plan, and check the plan as a run does.
 
     Args:
-        data: UTF-8, what ``labseq plan --json`` writes.
-        request: Names the profile with grid and motion; without one the grid is that of
-            the file, and the motion the paper's. Nothing is planned.
+        data: The output of ``labseq plan --json``, in UTF-8.
+        request: Names the profile with grid and motion. Without a profile the grid is the file's, and the
+            motion the paper's. Nothing is planned.
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
 
     Raises:
-        ConfigError: It is not a plan, it does not fit the grid or breaks a rule, or the request
-            asks for something to be planned.
+        ConfigError: It is not a plan, it does not fit the grid or breaks a rule, or the request has options
+            for planning.
     """
     from labseq.kernels.kernel import announcing
 
@@ -254,7 +253,7 @@ def _machine(file: PlanFile, name: str, request: PlanRequest) -> Machine:
         option = (
             f"--{options[0]}".replace("degree_of_parallelism", "dop") if options else for_planner[0].source
         )
-        what = f"{name} is already a plan: there is nothing to plan"
+        what = f"{name} is already a plan, so there is nothing to plan"
         raise ConfigError(Problem(what, option, hint="leave the option out, or give an occupancy"))
     if request.profile is None and not for_profile:
         return Machine(file.grid, MotionSpec())

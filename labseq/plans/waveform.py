@@ -1,4 +1,4 @@
-"""The waveform of one plan, without a run; and its samples in a file."""
+"""Makes the waveform of one plan without a run, and saves its samples."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from labseq.text_files import check_output, read_bytes
 from labseq.units import format_quantity, parse_quantity
 
 DEFAULT_RATE_HZ: Final = 625e6
-"""Default sample rate: that of the paper's AWG."""
+"""Default sample rate, from the paper's AWG."""
 
 MAX_RATE_HZ: Final = 10e9
-"""Maximum accepted sample rate, far above that of any AWG."""
+"""Maximum accepted sample rate, far above any AWG's."""
 
 PLAN_SUFFIX: Final = ".json"
 
@@ -47,7 +47,7 @@ _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 @dataclass(frozen=True, slots=True)
 class SampleRate:
-    """Samples per second and channel; where the rate comes from ("" for the default); a warning, or ""."""
+    """Samples per second and channel, the source of the rate ("" for the default), and a warning or ""."""
 
     hz: float
     source: str = ""
@@ -60,7 +60,7 @@ def read_moves(
     """Read a plan (a file that ends in .json, or JSON on "-"), or read an occupancy and plan for it.
 
     Returns:
-        The checked plan, and the profile that a shot was taken with; empty if there is none.
+        The checked plan, and the profile that a shot was taken with, or an empty profile.
     """
     if request.occupancy == "-":
         data = (stdin or sys.stdin.buffer).read(MAX_BYTES + 1)
@@ -77,14 +77,14 @@ def read_moves(
 
 
 def read_sample_rate(text: str | None, request: PlanRequest, machine: dict[str, Any]) -> SampleRate:
-    """Find the sample rate: that of the option, else the profile's, else the paper's.
+    """Find the sample rate from the option, else from the profile, else use the paper's.
 
     A profile has one if the plugin of its mobile tweezers has a setting ``sample_rate``.
 
     Args:
-        text: Value of the option, such as "625 MHz"; None without it.
+        text: Value of the option, such as "625 MHz", or None.
         request: Names the profile, if there is one.
-        machine: The profile that a shot was taken with; may be empty.
+        machine: The profile that a shot was taken with. May be empty.
     """
     if text is not None:
         return _parse(text)
@@ -124,10 +124,10 @@ def _of_profile(profile: str, overrides: Sequence[str]) -> SampleRate:
 
 
 def read_batches(text: str | None, plan: Plan) -> range:
-    """Read a selection of batches; a chain of linked batches must not be cut.
+    """Read a selection of batches, which must not cut a chain of linked batches.
 
     Args:
-        text: "2" or "1-3", counted from 0; None for all.
+        text: "2" or "1-3", counted from 0, or None for all.
         plan: The plan.
 
     Returns:
@@ -141,7 +141,7 @@ def read_batches(text: str | None, plan: Plan) -> range:
     if text is None:
         return range(n)
     option = clean(f"--batches {text}")
-    expected = f"a number from 0 to {n - 1}, or two of them as in 0-{n - 1}" if n > 1 else "0, the only one"
+    expected = f"a number from 0 to {n - 1}, or a range such as 0-{n - 1}" if n > 1 else "0, the only batch"
     match = re.fullmatch(r"\s*(\d{1,6})\s*(?:-\s*(\d{1,6})\s*)?", text)
     if match is None:
         raise ConfigError(Problem("these are not batches", option, expected=expected))
@@ -160,7 +160,7 @@ def read_batches(text: str | None, plan: Plan) -> range:
 
 
 MAX_DURATION_S: Final = 60.0
-"""Maximum playing time, far longer than any cycle; a longer one is a mistake and would take hours."""
+"""Maximum playing time, far longer than any cycle. A longer time is a mistake and would take hours."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,9 +168,9 @@ class WaveformRequest:
     """The arguments of ``labseq waveform``, as text.
 
     Attributes:
-        plan: The request for a plan, whose occupancy may be a plan, too: see :func:`read_moves`.
-        batches: "2" or "1-3", from 0; None for all.
-        sample_rate: A frequency; None for the profile's.
+        plan: The request for a plan. Its occupancy may also be a plan, as in :func:`read_moves`.
+        batches: "2" or "1-3", from 0, or None for all.
+        sample_rate: A frequency, or None for the profile's.
     """
 
     plan: PlanRequest
@@ -239,12 +239,12 @@ def plan_waveform(
 
     Args:
         request: The plan, its batches and the sample rate.
-        stdin: What "-" reads; standard input if None.
+        stdin: Stream that "-" reads, or None for standard input.
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
 
     Raises:
         ConfigError: The request has an error, or there is nothing to play.
-        PluginLoadError: A plugin that is named failed to load.
+        PluginLoadError: A named plugin failed to load.
         PlanError: The planner failed, or its plan breaks a rule.
         LimitError: The tones break a limit of AOD or amplifier.
     """
@@ -255,7 +255,7 @@ def plan_waveform(
     if moves.plan.n_batches == 0:
         hint = "choose an occupancy and a target that need moves"
         raise ConfigError(
-            Problem("there is nothing to play: the plan has no batches", moves.source, hint=hint)
+            Problem("there is nothing to play because the plan has no batches", moves.source, hint=hint)
         )
     batches = read_batches(request.batches, moves.plan)
     with announcing(announce):
@@ -266,12 +266,12 @@ def plan_waveform(
     played = range(segments[0], segments[-1] + 1)
     waveform = PlannedWaveform(moves, program, renderer, batches, played, tuple(filter(None, [rate.warning])))
     if not waveform.tones_on_s * rate.hz >= 1:
-        what = f"there is nothing to play: tones are on for {waveform.tones_on_s} s"
+        what = f"there is nothing to play because tones are on for {waveform.tones_on_s} s"
         raise ConfigError(Problem(what, moves.source))
     if waveform.duration_s > MAX_DURATION_S:
         what = f"the waveform is {format_quantity(waveform.duration_s, 'time')} long"
         most = f"at most {format_quantity(MAX_DURATION_S, 'time')}"
-        hint = "look at the grid's spacing and at the speed, or choose some of the batches with --batches"
+        hint = "check the grid's spacing and the speed, or choose some of the batches with --batches"
         raise ConfigError(Problem(what, moves.source, expected=most, hint=hint))
     return waveform
 
@@ -307,8 +307,8 @@ def check_samples_file(path: Path) -> None:
     """Check name and folder of a file of samples before anything is planned.
 
     Raises:
-        ConfigError: It has another ending than .npz, its folder does not exist, or the path
-            is not an ordinary file.
+        ConfigError: The name does not end in .npz, its folder does not exist, or the path is not an ordinary
+            file.
     """
     check_output(path, "an NPZ file", ".npz")
 
@@ -316,17 +316,17 @@ def check_samples_file(path: Path) -> None:
 def save_samples(path: Path, waveform: PlannedWaveform) -> None:
     """Write the samples to a file, which appears only when it is complete.
 
-    ``numpy.load`` then gives ``samples``, int16 (2, n), channel 0 for the row axis, and, counted
-    in samples, where its batches and segments start; see :func:`arrays_of`. The samples are
-    rendered and written piece by piece. Nothing is compressed: samples hardly can be.
+    ``numpy.load`` then gives ``samples``, int16 (2, n), channel 0 for the row axis, and the first samples of
+    batches and segments, as in :func:`arrays_of`. The samples are rendered and written piece by piece,
+    without compression because samples hardly compress.
 
     Args:
-        path: The file; an older one of that name is replaced.
+        path: The file. It replaces an older file.
         waveform: The waveform.
 
     Raises:
-        ConfigError: It cannot be written, for example to a full disk; or :func:`check_samples_file`
-            refuses it.
+        ConfigError: It cannot be written, for example to a full disk, or :func:`check_samples_file` refuses
+            it.
     """
     check_samples_file(path)
     try:
@@ -334,18 +334,18 @@ def save_samples(path: Path, waveform: PlannedWaveform) -> None:
             _write(file, waveform)
     except OSError as error:
         what = f"the samples cannot be written: {error.strerror or error}"
-        expected = f"{waveform.n_bytes / 1e6:.1f} MB of room and the right to write there"
+        expected = f"{waveform.n_bytes / 1e6:.1f} MB of room and permission to write there"
         raise ConfigError(Problem(what, visible(str(path)), expected=expected)) from error
 
 
 def arrays_of(waveform: PlannedWaveform) -> dict[str, NDArray[Any]]:
-    """Everything except the samples; indices of batches count from 0.
+    """Everything except the samples. Indices of batches count from 0.
 
     Returns:
-        Name -> array: ``sample_rate_hz``; ``volts_per_sample``, float64 (2,), volts across 50 Ohm of
-        a sample of 1; ``batch``, int32 (n_batches,), the batches; ``batch_start``, int64, first
-        sample of each that has tones; ``segment_batch``, ``segment_kind`` (0 pause, 1 pick-up,
-        2 transport, 3 drop-off) and ``segment_start`` of each segment.
+        Arrays by name. ``volts_per_sample``, float64 (2,), is the voltage across 50 Ohm of a sample of 1.
+        ``batch``, int32 (n_batches,), are the batches. ``batch_start``, int64, is the first sample of each
+        batch that has tones. Each segment has a ``segment_batch``, ``segment_kind`` (0 pause, 1 pick-up, 2
+        transport, 3 drop-off) and ``segment_start``. ``sample_rate_hz`` is the sample rate.
     """
     program, segments, batches = waveform.program, waveform.segments, waveform.batches
     part = slice(segments.start, segments.stop)

@@ -1,4 +1,4 @@
-"""Pictures of waveforms: the power of each tone against time."""
+"""Draws waveforms as the power of each tone against time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AT_ONCE: Final = 32
-"""Windows that are transformed together, in a few megabytes."""
+"""Windows that are transformed together, which take a few megabytes."""
 
 CHUNK: Final = 1 << 18
 """Samples that are rendered at a time."""
@@ -28,11 +28,11 @@ CHUNK: Final = 1 << 18
 
 @dataclass(frozen=True, slots=True)
 class WaveformPieces:
-    """Pieces of a waveform, laid end to end: what a picture shows of it.
+    """Pieces of a waveform that a picture shows end to end.
 
     Attributes:
         first: int64 (n,), first sample of each piece in the waveform.
-        at: int64 (n + 1,), where each piece starts in the picture, in samples, and the end.
+        at: int64 (n + 1,), start of each piece in the picture, in samples, and the end.
     """
 
     first: NDArray[np.int64]
@@ -43,7 +43,7 @@ class WaveformPieces:
         """Lay pieces end to end.
 
         Args:
-            pieces: First sample of each, and the one after its last.
+            pieces: First sample of each, and the sample after its last.
 
         Example:
             >>> WaveformPieces.of([(10, 14), (20, 25)]).at.tolist()
@@ -67,7 +67,7 @@ class WaveformPieces:
 def spectrogram(
     renderer: Renderer, channel: int, stretches: WaveformPieces, n_columns: int, band_hz: tuple[float, float]
 ) -> tuple[NDArray[np.float32], tuple[float, float]]:
-    """Compute how strong each frequency is, column by column, without ever holding all samples.
+    """Compute the strength of each frequency column by column, without ever holding all samples.
 
     Args:
         channel: 0 for the row tones, 1 for the column tones.
@@ -86,7 +86,7 @@ def spectrogram(
     low, high = (int(np.rint(hz / rate_hz * n_fft)) for hz in band_hz)
     low, high = max(0, low), min(n_fft // 2, max(low, high))
     wide = stretches.n_samples / n_columns
-    n_windows = min(8, math.ceil(2 * wide / length))  # so of a long program not all samples are used
+    n_windows = min(8, math.ceil(2 * wide / length))  # so a long program does not use all samples
     centre = (np.arange(n_columns * n_windows) + 0.5) * (wide / n_windows)
     start = np.maximum(0, stretches.in_waveform(centre.astype(np.int64)) - length // 2)
     samples = np.empty((AT_ONCE, length), np.int16)
@@ -141,19 +141,19 @@ KINDS: Final = {
 INTENDED, PEAK, CUT = "#c8102e", "#4e79a7", "0.35"
 DASHES: Final = (0, (4, 3))
 LABELS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
-"""Intervals of the batch numbers: the first whose labels have enough room is used."""
+"""Intervals of the batch numbers. The first interval with enough room for its labels is used."""
 LABEL_PART: Final = (0.008, 0.0067)
 """The space next to a number, and the width of a digit, as parts of the picture's width."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WaveformDrawing:
-    """What is drawn: the intended tones of a program, and the samples of its renderer.
+    """The intended tones of a program and the samples of its renderer, to draw.
 
     Attributes:
-        source: Where the plan comes from; the line below the title.
+        source: Source of the plan, for the line below the title.
         notes: Titles of the row axis and of the column axis.
-        segments: The segments of the program that are drawn; at least one has tones.
+        segments: The segments of the program to draw. At least one has tones.
     """
 
     title: str
@@ -167,11 +167,11 @@ class WaveformDrawing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Timeline:
-    """Where the segments with tones are in the picture, the pauses between them left out.
+    """Places of the segments with tones in the picture, without the pauses between them.
 
     Attributes:
         on: Their indices in the program.
-        at_s: float64 (n + 1,), where each starts in the picture, and the end.
+        at_s: float64 (n + 1,), start of each segment in the picture, and the end.
         stretches: The same in samples.
     """
 
@@ -212,7 +212,7 @@ def _draw(drawing: WaveformDrawing) -> Figure:
         image.set_clim(top_db - 50, top_db)
     bar = figure.colorbar(images[0], ax=panels[1:], pad=0.01, aspect=40)
     bar.set_label("samples: level / dB of a tone at full scale")
-    left_out = " (vertical lines: pauses left out)" if _cuts(program, timeline) else ""
+    left_out = " (vertical lines mark omitted pauses)" if _cuts(program, timeline) else ""
     panels[-1].set_xlabel(f"playing time with tones on / ms{left_out}")
     panels[-1].set_xlim(0.0, 1e3 * float(timeline.at_s[-1]))
     _write_head(figure, drawing)
@@ -243,13 +243,13 @@ def _lay_out(drawing: WaveformDrawing) -> _Timeline:
 
 
 def _cuts(program: ToneProgram, timeline: _Timeline) -> list[float]:
-    """Where a pause was left out, in ms."""
+    """Times of omitted pauses, in ms."""
     pairs = enumerate(pairwise(timeline.on), start=1)
     return [1e3 * float(timeline.at_s[k]) for k, (a, b) in pairs if program.duration_s[a + 1 : b].sum() > 0.0]
 
 
 def _draw_batches(axes: Axes, program: ToneProgram, timeline: _Timeline) -> None:
-    """A strip that says which batch plays, and what it does."""
+    """Draw a strip that says which batch plays and what it does."""
     at_ms, on = 1e3 * timeline.at_s, np.array(timeline.on)
     for kind, (_, colour) in KINDS.items():
         its = np.flatnonzero(program.kind[on] == kind)
@@ -272,7 +272,7 @@ def _draw_batches(axes: Axes, program: ToneProgram, timeline: _Timeline) -> None
 
 
 def _fit(places: Floats, needed: float) -> bool:
-    """Whether labels at these places are at least as far apart as needed."""
+    """True if labels at these places are far enough apart."""
     return len(places) < 2 or float(np.diff(places).min()) >= needed
 
 
@@ -290,7 +290,7 @@ def _draw_spectrogram(axes: Axes, drawing: WaveformDrawing, channel: int, timeli
         drawing.renderer, channel, timeline.stretches, n_columns, (low_hz, high_hz)
     )
     extent = 0.0, 1e3 * float(timeline.at_s[-1]), 1e-6 * edges_hz[0], 1e-6 * edges_hz[1]
-    # 25 shades, one per 2 dB: steps that the eye hardly sees halve the size of the file
+    # 25 shades, one per 2 dB, because steps that the eye hardly sees halve the size of the file
     shades = LinearSegmentedColormap.from_list("samples", ("white", "0.75", "0.4"), N=25)
     image = axes.imshow(
         level_db, extent=extent, origin="lower", aspect="auto", cmap=shades, interpolation="nearest"
@@ -308,7 +308,7 @@ def tone_lines(program: ToneProgram, tones: AxisTones, on: list[int], at_s: Floa
     """Lines of the intended tones of an axis in the segments ``on``, which start at ``at_s`` in the picture.
 
     Returns:
-        Time in the picture in s, and frequency in Hz: one float64 (n_points, 2) per tone and segment.
+        Time in the picture in s, and frequency in Hz, as one float64 (n_points, 2) per tone and segment.
     """
     lines: list[Floats] = []
     for k, i in enumerate(on):
@@ -324,7 +324,7 @@ def tone_lines(program: ToneProgram, tones: AxisTones, on: list[int], at_s: Floa
 
 
 def _draw_envelope(axes: Axes, drawing: WaveformDrawing, channel: int, timeline: _Timeline) -> None:
-    # columns of at least 2 us: some periods of the beat of neighbouring tones
+    # columns of at least 2 us contain some periods of the beat of neighbouring tones
     n_columns = max(1, min(N_COLUMNS, int(timeline.at_s[-1] / 2e-6)))
     volts = drawing.rf.full_scale_v * envelope(drawing.renderer, channel, timeline.stretches, n_columns)
     edges_ms = np.linspace(0.0, 1e3 * timeline.at_s[-1], n_columns + 1)

@@ -1,4 +1,4 @@
-"""`labseq waveform`: the output of the AWG for a plan, as numbers, picture and samples."""
+"""`labseq waveform` gives the output of the AWG for a plan as numbers, picture and samples."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class WaveformOutput:
     """The files to write in addition to the report.
 
     Attributes:
-        json: Name of the file for the numbers as JSON; "-" for stdout, which then holds nothing else.
+        json: Name of the file for the numbers as JSON, or "-" for stdout, which then holds nothing else.
         png: The file for the picture.
         npz: The file for the samples.
     """
@@ -78,26 +78,26 @@ def _draw(waveform: PlannedWaveform, report: WaveformReport, path: Path) -> None
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaveformReport:
-    """What is played for a plan, SI.
+    """The output for a plan, in SI units.
 
     Attributes:
         source: Origin of the plan or of its occupancy.
         subject: Occupancy, target and planner, in words.
         planner: Name of the planner.
-        degree_of_parallelism: Maximum number of tweezers on at once, which the plan was checked for.
-        seed: Seed of all random numbers; None if there is none.
+        degree_of_parallelism: Maximum number of tweezers on at once in the check of the plan.
+        seed: Seed of all random numbers, or None.
         first_batch: Index of the first batch that is played, from 0.
         n_batches: Number of batches that are played.
         n_batches_of_plan: Number of all batches.
         duration_s: Playing time, pauses included.
-        tones_on_s: The same without the pauses between batches.
+        tones_on_s: Playing time without the pauses between batches.
         sample_rate_hz: Samples per second.
         n_samples: Samples per channel.
         n_bytes: Size of the samples of both channels.
         max_peak_v: Limit of the peak voltage of a channel.
         max_mean_power_w: Limit of the mean power at an AOD.
-        row: What the row axis plays.
-        column: What the column axis plays.
+        row: Output of the row axis.
+        column: Output of the column axis.
     """
 
     source: str
@@ -164,7 +164,7 @@ class WaveformReport:
         return f"{which} ({self.n_batches} of {self.n_batches_of_plan})"
 
     def as_text(self) -> list[str]:
-        """The subject and the totals; below them a table with a column for each axis."""
+        """The subject and the totals, above a table with a column for each axis."""
         samples = f"{self.n_samples} per channel at {self.rate_text}, {size_text(self.n_bytes)}"
         facts = [
             *self.subject.items(),
@@ -177,7 +177,7 @@ class WaveformReport:
         return [*aligned(facts), "", *aligned([["", *(f"{axis.name} axis" for axis in axes)], *numbers])]
 
     def _numbers(self) -> Sequence[tuple[str, Callable[[AxisStatistics], str]]]:
-        """Name of each number of an axis, and how it is written."""
+        """Name of each number of an axis, and its format."""
         volts, watts = _volts(self.max_peak_v), _watts(self.max_mean_power_w)
         return (
             ("tones at once", lambda axis: f"at most {axis.max_tones}"),

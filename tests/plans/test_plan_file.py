@@ -55,8 +55,14 @@ BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda v: v["batches"][0].update(to=[[0, 1.5]]), "to.0.1 is 1.5; expected a whole number"),
     (lambda v: v["batches"][0].update(to=[[0, 99999]]), "to.0.1 is 99999; expected at most 2000"),
     (lambda v: v["batches"][0].update(form=[]), "'form' is not a setting of"),
-    (lambda v: v["grid"].update(n_rows=3), "'occupancy' is not of the grid's shape; expected 3 rows of 3"),
-    (lambda v: v["target"].update(fill=[[0, 1], [0]]), "'fill' is not of the grid's shape; expected 2 rows"),
+    (
+        lambda v: v["grid"].update(n_rows=3),
+        "'occupancy' does not have the grid's shape; expected 3 rows of 3",
+    ),
+    (
+        lambda v: v["target"].update(fill=[[0, 1], [0]]),
+        "'fill' does not have the grid's shape; expected 2 rows",
+    ),
     (lambda v: v["target"].update(clear=v["target"]["fill"]), "a site cannot be in both fill and clear"),
     (lambda v: v["occupancy"][0].__setitem__(0, 2), "occupancy.0.0 is 2; expected at most 1"),
     (lambda v: v["grid"].update(spacing_m=float("nan")), "spacing_m is nan; expected a finite number"),

@@ -52,7 +52,7 @@ def test_numpy_reads_what_the_awg_would_play(made: PlannedWaveform, tmp_path: Pa
     ("name", "message"),
     [
         ("a.npy", "a.npy: this is not the name of an NPZ file; expected a file that ends in .npz"),
-        ("gone/a.npz", "gone: there is no such folder; expected one that exists"),
+        ("gone/a.npz", "gone: there is no such folder; expected an existing folder"),
         ("folder.npz", "folder.npz: this is a folder"),
         ("device.npz", "device.npz: this is not an ordinary file"),
     ],

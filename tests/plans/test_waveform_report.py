@@ -120,7 +120,7 @@ BAD = [
     ([*WORDS, "--batches", "9-99"], "there are no such batches; expected a number from 0 to "),
     ([*WORDS, "--batches", "first"], "--batches first: these are not batches"),
     ([*WORDS, "--sample-rate", "1"], "cannot be sampled at 1 Hz; expected more than 211.2 MHz"),
-    ([*WORDS, "--png", "gone/a.png"], "gone: there is no such folder; expected one that exists"),
+    ([*WORDS, "--png", "gone/a.png"], "gone: there is no such folder; expected an existing folder"),
     ([*WORDS, "--npz", "a.npy"], "a.npy: this is not the name of an NPZ file"),
     (["one.json", "--json", "one.json"], "one.json: this file is named twice, and one would replace the"),
     ([*WORDS, "--json", "folder.json", "--npz", "a.npz"], "folder.json: it cannot be written: Is a"),
