@@ -1,4 +1,4 @@
-"""The planner ``auto``: of ``psca`` and ``grid``, the one that is expected to leave the fewest defects."""
+"""The planner ``auto``, which uses ``psca`` or ``grid``, whichever is expected to leave fewer defects."""
 
 from __future__ import annotations
 

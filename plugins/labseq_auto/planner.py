@@ -1,4 +1,4 @@
-"""The planner ``auto``: it compares other planners on random loadings of the target, and uses the best."""
+"""The planner ``auto``, which compares other planners on random loadings of the target and uses the best."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ class AutoSettings(Settings):
     loading: Fraction | None = Field(
         default=None,
         gt=0,
-        description="fraction of the sites that hold an atom in the loadings that planners are compared on; "
-        "left out: that of the simulation, else 75 %",
+        description="fraction of sites with an atom in the loadings on which planners are compared; default: "
+        "loading of the simulation, else 75 %",
     )
 
 
 TWEEZERS: Final = (2, 4, 7, 10, 15, 20, 40)
-"""Numbers of tweezers that are compared, those of the figures of the paper among them."""
+"""Numbers of tweezers to compare, including those in the figures of the paper."""
 PLANNERS: Final[dict[str, dict[str, Any]]] = {"psca": {}, "grid": {"lanes": "weaving"}}
-"""Planners that are compared, with their settings: those that lose fewest atoms of all that labseq has."""
+"""Planners to compare, with their settings. They lose fewer atoms than labseq's other planners."""
 SHALLOWEST: Final = 0.8
-"""Least depth of tweezers on paths at which predicted losses hold, see docs/explanation/survival.md."""
+"""Least depth of tweezers on paths at which predicted losses are valid, see docs/explanation/survival.md."""
 SITES: Final = 5000
-"""About how many sites the loadings have in all: 12 of 20 x 20."""
+"""Approximate number of sites in all loadings, 12 of 20 x 20."""
 LOADINGS: Final = (3, 12)
 """Least and greatest number of loadings."""
 
@@ -53,7 +53,7 @@ class Candidate:
     """A planner with its settings.
 
     Attributes:
-        name: For messages.
+        name: Name for messages.
         planner: The planner.
         tweezers: Most tweezers on at once.
     """
@@ -64,15 +64,15 @@ class Candidate:
 
 
 class AutoPlanner:
-    """Plans as the planner does that is expected to leave the fewest defects of a target.
+    """Plans with the planner that is expected to leave the fewest defects of a target.
 
-    Which one that is depends on grid, lattice, target, light and losses. It is worked out by
-    :func:`labseq.plugin.planning.expect` on loadings that are always the same, when a target first comes.
+    The best planner depends on grid, lattice, target, light and losses. When a target first comes, it is
+    found by :func:`labseq.plugin.planning.expect` on loadings that are always the same.
 
     Args:
         settings: The planner's settings.
         context: Its grid, motion and losses decide.
-        registry: Has the other planners.
+        registry: Registry with the other planners.
 
     Attributes:
         degree_of_parallelism: Most tweezers on at once of any candidate.
@@ -89,13 +89,13 @@ class AutoPlanner:
         self._chosen, self._why = self._candidates[0], list[str]()
 
     def _all(self, registry: Registry) -> list[Candidate]:
-        """The planners that this machine allows; psca, which needs no lanes, is always among them."""
+        """The planners that this machine allows. They always include psca, which needs no lanes."""
         most, found = self._context.motion.max_tweezers, list[Candidate]()
         for name, settings in PLANNERS.items():
             entry = registry.get("planner", name)
             model: Any = entry.settings_model
             if "lanes" in settings and self._context.motion.path_depth < SHALLOWEST:
-                depth = f"at a path_depth below {SHALLOWEST:g} more atoms fall out than is predicted"
+                depth = f"at a path_depth below {SHALLOWEST:g} more atoms fall out than predicted"
                 self._why_not.append(f"{name} is left out: {depth}")
                 continue
             try:
@@ -104,7 +104,7 @@ class AutoPlanner:
                     words = f"{name} with {n} tweezer{'s' * (n > 1)}"
                     found.append(Candidate(words, entry.factory(values, self._context), n))
             except LimitError as error:
-                why = "; ".join(str(error).split("; ")[:2])  # the rest is for those who named the planner
+                why = "; ".join(str(error).split("; ")[:2])  # the rest is for users who named the planner
                 self._why_not.append(f"{name} is left out: {why}")
         return found
 
@@ -143,7 +143,7 @@ class AutoPlanner:
         return expect(candidate.planner.plan, loadings, target, candidate.tweezers, grid, motion, window_s)
 
     def plan(self, occupancy: ArrayLike, target: TargetPattern) -> Plan:
-        """Plan as the planner does that was chosen for the target.
+        """Plan with the planner that was chosen for the target.
 
         Args:
             occupancy: bool (n_rows, n_cols), as detected.

@@ -1,4 +1,4 @@
-"""A scanner that climbs: the shortest one that is of use, to begin your own with."""
+"""A scanner that climbs, as a short example to start your own scanner from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the best point so far a step along one address, up or down; when none is left, half the step."""
+"""Steps from the best point so far along one address, and halves the step when none is left."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ Part = Annotated[float, Field(ge=0.001, le=1)]
 
 
 class ClimbSettings(Settings):
-    """How far it looks, in parts of the range of each address."""
+    """How far it steps, in fractions of the range of each address."""
 
-    step: Part = Field(default=0.25, description="first step, as a part of each range")
-    min_step: Part = Field(default=0.05, description="no step is shorter; the scan ends when none is left")
+    step: Part = Field(default=0.25, description="first step, as a fraction of each range")
+    min_step: Part = Field(default=0.05, description="shortest step; the scan ends when none is left")
 
 
 class Climb:
-    """Steps from the best point along one address, up or down; halves the step if none is left."""
+    """Steps from the best point along one address, up or down, and halves the step if none is left."""
 
     def __init__(self, settings: ClimbSettings, space: ScanSpace) -> None:
         self._settings = settings
         self._ranges = space.ranges
 
     def next_point(self, visited: Sequence[VisitedPoint]) -> Mapping[str, float] | None:
-        """The first unvisited neighbour of the best point; the first point is that of the files."""
+        """The first unvisited neighbour of the best point. The scan starts at the point of the files."""
         if not visited:
             return {r.address: r.at(0.5 if isnan(r.start) else r.fraction(r.start)) for r in self._ranges}
         scores: dict[tuple[float, ...], list[float]] = defaultdict(list)
@@ -48,5 +48,5 @@ class Climb:
         return None
 
     def _place(self, values: Mapping[str, float]) -> tuple[float, ...]:
-        """Where a point is in its ranges, 0 to 1, to four digits: no two points are nearer on purpose."""
+        """Position of a point in its ranges, 0 to 1, to four digits. No two points are nearer on purpose."""
         return tuple(round(r.fraction(values[r.address]), 4) for r in self._ranges)

@@ -1,4 +1,4 @@
-"""Static tweezers that another system holds; labseq controls nothing of them."""
+"""Static tweezers that another system holds and labseq does not control."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the static tweezers ``external``; in a dry run their virtual twin takes their place."""
+    """Offer the static tweezers ``external``, which their virtual twin replaces in a dry run."""
     registry.static_tweezers("external", ExternalStaticTweezers, ExternalSettings)
 
 
 class ExternalSettings(Settings):
-    """Static tweezers that another system holds; they have no settings."""
+    """Static tweezers that another system holds, which have no settings."""
 
     def identities(self) -> tuple[str, ...]:
-        """Nothing: any number of processes may rely on them."""
+        """Nothing, because any number of processes may rely on them."""
         return ()
 
 
@@ -52,7 +52,7 @@ class ExternalStaticTweezers(StaticTweezers):
 
     @property
     def facts(self) -> TweezersFacts:
-        """Nothing can be set; a line of the timing box may release the atoms."""
+        """Nothing can be set, but a line of the timing box may release the atoms."""
         return TweezersFacts(control="nothing", ramps=False)
 
     def open(self) -> None:
@@ -64,24 +64,26 @@ class ExternalStaticTweezers(StaticTweezers):
         self._is_open = False
 
     def safe_state(self) -> None:
-        """Do nothing: the light belongs to the other system."""
+        """Do nothing, because the light belongs to the other system."""
 
     def load(self, amplitudes: tuple[NDArray[Any], NDArray[Any]] | None) -> None:
-        """Accept None alone.
+        """Accept only None.
 
         Raises:
             LimitError: Amplitudes are given.
         """
         self._check_open()
         if amplitudes is not None:
-            raise LimitError(f"{self._name}: amplitudes", "given", "none: another system holds the array")
+            raise LimitError(
+                f"{self._name}: amplitudes", "given", "none, because another system holds the array"
+            )
 
     def start(self) -> None:
-        """Do nothing: the array is at its nominal depth."""
+        """Do nothing, because the array is at its nominal depth."""
         self._check_open()
 
     def ramp(self, depth: float, duration_s: float) -> None:
-        """Accept the nominal depth alone.
+        """Accept only the nominal depth.
 
         Raises:
             LimitError: Another depth.
@@ -89,10 +91,10 @@ class ExternalStaticTweezers(StaticTweezers):
         self._check_open()
         if depth != 1.0 or not duration_s >= 0:
             value = f"{depth:g} of the nominal depth within {duration_s:g} s"
-            raise LimitError(f"{self._name}: ramp", value, "to 1 only: another system holds the array")
+            raise LimitError(f"{self._name}: ramp", value, "1, because another system holds the array")
 
     def describe(self) -> Mapping[str, Any]:
-        """That nothing is known of them."""
+        """Say that nothing is known of them."""
         return {"model": "held by another system"}
 
     def _check_open(self) -> None:

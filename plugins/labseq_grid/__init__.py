@@ -1,4 +1,4 @@
-"""A planner that moves rows x columns of atoms at once, straight from the reservoir to the vacancies."""
+"""A planner that moves rows x columns of atoms at once, directly from the reservoir to the vacancies."""
 
 from labseq.plugin import Registry, hookimpl
 

@@ -1,12 +1,12 @@
 """Kernels that choose the columns of a batch whose rows are given.
 
-A batch takes the atoms of ``k`` source rows to as many goal rows, in order, and those of its source
-columns to as many goal columns, in order. What a column holds in these rows is a *pattern*: bit i stands
-for row i. A source column with pattern a can go to a goal column with the vacancies b if a is part of b.
+A batch takes the atoms of ``k`` source rows to as many goal rows, in order, and the atoms of its source
+columns to as many goal columns, in order. The content of a column in these rows is a *pattern*, in which bit
+i is row i. A source column with pattern a can go to a goal column with the vacancies b if a is part of b.
 
-What a batch costs is the expected number of atoms lost, less what no way to its vacancies avoids. In all
-kernels ``rows``, int64 (2, >= k), are the source rows and the goal rows, ascending, and ``columns``, int64
-(3, n_cols), pattern, goal and source of each column, ascending.
+The cost of a batch is the expected number of atoms lost, less the losses that no way to its vacancies avoids.
+In all kernels ``rows``, int64 (2, >= k), are the source rows and the goal rows, ascending, and ``columns``,
+int64 (3, n_cols), pattern, goal and source of each column, ascending.
 """
 
 from __future__ import annotations
@@ -31,38 +31,38 @@ STAYS: Final = 3
 MAX_ROWS: Final = 4
 """Maximum number of rows of a batch."""
 TOLERANCE: Final = 1e-9
-"""Losses that differ by less, in atoms, are equal: otherwise rounding would decide."""
+"""Losses that differ by less, in atoms, are equal, so that rounding does not decide."""
 
 Lattice = tuple[Bytes, Bytes, Floats]
-"""The sites of one orientation: EMPTY, SPARE, UNWANTED or STAYS, uint8 (n_rows, n_cols); 1 where an atom may
-be dropped off, uint8; losses that no way to a vacancy avoids, float64; arrays of the same shape."""
+"""The sites of one orientation, in three arrays (n_rows, n_cols). They hold EMPTY, SPARE, UNWANTED or STAYS,
+uint8, 1 where an atom may be dropped off, uint8, and the losses that no way to a vacancy avoids, float64."""
 LATTICE: Final = "Tuple((uint8[:, ::1], uint8[:, ::1], float64[:, ::1]))"
 Limits = tuple[int, int, int, int]
-"""Maximum number of tweezers, of rows and of columns of a batch; of columns from a source to its goal."""
+"""Maximum number of tweezers, rows and columns of a batch, and of columns from a source to its goal."""
 LIMITS: Final = "UniTuple(int64, 4)"
 Costs = tuple[float, float, float, float, float]
-"""Expected losses: of a batch without ways, of one site of its longest way, of a further stage of its
-drop-off, of one site of the way of a tweezer (its atom costs as much again), of taking an atom that might
+"""Expected losses of a batch without ways, of one site of its longest way, of a further stage of its
+drop-off, of one site of the way of a tweezer (its atom costs as much again), and of taking an atom that might
 stay where others must go."""
 COSTS: Final = "UniTuple(float64, 5)"
 Work = tuple[Ints, Floats, Floats, NDArray[np.int16], Ints, Floats, Floats]
-"""Work space, see :func:`workspace`."""
+"""Scratch arrays of :func:`workspace`."""
 WORK: Final = (
     "Tuple((int64[::1], float64[::1], float64[::1], int16[:, ::1], int64[::1], float64[::1], float64[::1]))"
 )
 View = tuple[Lattice, Limits, Costs, Work]
-"""One orientation of the grid: rows and columns as they are, or swapped."""
+"""One orientation of the grid, with rows and columns as they are, or swapped."""
 VIEW: Final = f"Tuple(({LATTICE}, {LIMITS}, {COSTS}, {WORK}))"
 
 
 @helper_kernel(f"{WORK}(int64)")
 def workspace(n: int) -> Work:
-    """Work space for lines of up to ``n`` sites, see :func:`match_columns`.
+    """Scratch arrays of :func:`match_columns` for lines of up to ``n`` sites.
 
-    The pattern of each source column, -1 if an atom stays in it, int64 (n,); what its atoms to
-    spare gain, float64 (n,); the highest gain with sources before a column, float64 (n + 1,); the last
-    source of that, for each goal, int16 (n, n + 1); the goals, int64 (n,); the gain of each pattern,
-    float64; the costs of the columns, float64 (n,).
+    These are the pattern of each source column, -1 if an atom stays in it, int64 (n,), the gain of its atoms
+    to spare, float64 (n,), the highest gain with sources before a column, float64 (n + 1,), the last source
+    of this gain, for each goal, int16 (n, n + 1), the goals, int64 (n,), the gain of each pattern, float64,
+    and the costs of the columns, float64 (n,).
     """
     return (
         np.empty(n, np.int64),
@@ -84,7 +84,7 @@ def n_bits(pattern: int) -> int:
 
 @helper_kernel(f"void({VIEW}, int64[:, ::1], int64)")
 def read_sources(view: View, rows: Ints, k: int) -> None:
-    """Read the patterns of the source columns, and what their atoms to spare gain."""
+    """Read the patterns of the source columns, and the gain of their atoms to spare."""
     (source, _, _), _, costs, work = view
     for col in range(source.shape[1]):
         pattern, gain = 0, 0.0
@@ -100,10 +100,10 @@ def read_sources(view: View, rows: Ints, k: int) -> None:
 
 @helper_kernel(f"int64({VIEW}, int64[:, ::1], int64, int64, float64)")
 def read_goal(view: View, rows: Ints, k: int, col: int, price: float) -> int:
-    """Work out what each pattern gains in a goal column, less the ways along columns.
+    """Compute the gain of each pattern in a goal column, less the cost of the ways along columns.
 
     Returns:
-        The pattern of its vacancies; the gains of other patterns mean nothing.
+        The pattern of its vacancies. The gains of other patterns are meaningless.
     """
     (_, vacant, unavoidable), _, costs, work = view
     vacancies, gains = 0, work[5]
@@ -113,7 +113,7 @@ def read_goal(view: View, rows: Ints, k: int, col: int, price: float) -> int:
         ways = costs[3] * abs(rows[0, i] - row)
         gain = price + unavoidable[row, col] - ways
         for part in range(1 << i):
-            gains[part] -= ways  # of the tweezer
+            gains[part] -= ways  # cost of the tweezer
             gains[part | 1 << i] = gains[part] + gain
         vacancies |= int(vacant[row, col]) << i
     return vacancies
@@ -121,16 +121,16 @@ def read_goal(view: View, rows: Ints, k: int, col: int, price: float) -> int:
 
 @helper_kernel(f"int64({VIEW}, int64[:, ::1], int64, float64, int64[:, ::1])")
 def match_columns(view: View, rows: Ints, k: int, price: float, columns: Ints) -> int:
-    """Match source columns with goal columns in order, so that most is gained.
+    """Match source columns with goal columns in order, with the highest gain.
 
-    A dynamic programme over the goals, as for the longest common subsequence: for each column, the most
-    that sources before it can gain.
+    A dynamic programme over the goals, as for the longest common subsequence, finds for each column the
+    highest gain of sources before it.
 
     Args:
         view: The sites.
         rows: See the module.
         k: Number of rows.
-        price: What an atom gains.
+        price: Gain of an atom.
         columns: Result, see the module.
 
     Returns:
@@ -187,7 +187,7 @@ def trace_columns(view: View, n_goals: int, columns: Ints) -> int:
 
 @helper_kernel(f"void({VIEW}, int64[:, ::1], int64, int64[:, ::1], int64)")
 def find_costs(view: View, rows: Ints, k: int, columns: Ints, n: int) -> None:
-    """Find the costs of columns: their passes, less those of ways that cannot be avoided."""
+    """Find the costs of columns, which are their passes less the passes that no way avoids."""
     unavoidable, costs, spare, cost = view[0][2], view[2], view[3][1], view[3][6]
     for j in range(n):
         pattern, goal, source = columns[0, j], columns[1, j], columns[2, j]
@@ -201,7 +201,7 @@ def find_costs(view: View, rows: Ints, k: int, columns: Ints, n: int) -> None:
 
 @helper_kernel(f"boolean({VIEW}, int64[:, ::1], int64, int64[:, ::1], int64)")
 def lands_on_atom(view: View, rows: Ints, k: int, columns: Ints, j: int) -> bool:
-    """Whether a tweezer of a column without an atom would end on one."""
+    """True if an empty tweezer of a column would end on an atom."""
     for i in range(k):
         if not columns[0, j] >> i & 1 and view[0][0][rows[1, i], columns[1, j]] != EMPTY:
             return True
@@ -224,7 +224,7 @@ def sort_columns(cost: Floats, columns: Ints, n: int, order: Ints) -> None:
 
 @helper_kernel(f"Tuple((float64, int64))({VIEW}, int64[:, ::1], int64, int64[:, ::1], int64)")
 def cut_columns(view: View, rows: Ints, k: int, columns: Ints, n: int) -> tuple[float, int]:
-    """Keep those of some columns that cost least per atom, as many as limits allow.
+    """Keep the columns that cost least per atom, as many as limits allow.
 
     Returns:
         The cost per atom, and the number of columns.
@@ -281,7 +281,7 @@ def choose_columns(view: View, rows: Ints, k: int, price: float, columns: Ints) 
     """Choose the columns that cost least per atom, if that is less than ``price``.
 
     Returns:
-        The cost per atom, inf if there is no such choice; the number of columns.
+        The cost per atom, or inf without such a choice, and the number of columns.
     """
     n = match_columns(view, rows, k, price, columns)
     if n == 0:

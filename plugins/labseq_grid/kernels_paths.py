@@ -1,7 +1,7 @@
 r"""Kernels that turn rows and columns of a batch into paths of tones.
 
 The tweezers leave their sites for the *lanes* half-way between rows and half-way between columns, go along
-these, and reach their goals from there: in a lane they keep half a line's distance from every site. The way
+these, and reach their goals from there. In a lane they keep half a line's distance from every site. The way
 of one tweezer from row 0, column 0 to row 2, column 3::
 
     row 0   o       o       o       o      o  a site
@@ -14,7 +14,7 @@ of one tweezer from row 0, column 0 to row 2, column 3::
                                     5      5  then rows, and the tweezers are dropped off
     row 2   o       o       o       o
 
-A lane of a triangular lattice may weave, see :func:`add_travel`::
+A lane of a triangular lattice may weave, as in :func:`add_travel`::
 
     o       o       o       o
        ,-.     ,-.     ,-.
@@ -22,8 +22,8 @@ A lane of a triangular lattice may weave, see :func:`add_travel`::
      '     `-'     `-'     `
         o       o       o
 
-Positions are in lines: 2.0 is the third row or column, 2.5 the lane behind it. Everything is written for
-tones of the rows first; with rows and columns swapped it is the same.
+Positions are in lines, so 2.0 is the third row or column, and 2.5 the lane behind it. Everything is written
+for tones of the rows first. With rows and columns swapped it is the same.
 """
 
 from __future__ import annotations
@@ -42,28 +42,28 @@ Bools = NDArray[np.bool_]
 LANE: Final = 0.5
 """Distance of a lane from the lines of sites on both sides."""
 PARTS: Final = 8
-"""Parts of a site of a tweezer's way along a lane that weaves; with 6 corners come at the trap frequency."""
+"""Parts per site of a way along a lane that weaves. With 6 parts, corners come at the trap frequency."""
 
 Tones = tuple[Ints, Ints]
-"""Where the tones of an axis start, and where they end; int64 (n,) each."""
+"""Start and end of the tones of an axis, int64 (n,) each."""
 TONES: Final = "UniTuple(int64[::1], 2)"
 Band = tuple[int, int, int, int]
-"""First and last row, first and last column that the tones reach."""
+"""First and last row, and first and last column that the tones reach."""
 Knots = tuple[Floats, Floats, int]
-"""Positions of row tones and of column tones at each knot, float64 (max_knots, n), and how many knots."""
+"""Positions of row tones and of column tones at each knot, float64 (max_knots, n), and number of knots."""
 
 
 @helper_kernel()
 def find_lanes(lines: Ints, first: int, last: int, side: int) -> Floats:
-    """Choose a lane beside each of some lines, on the given side if that is possible.
+    """Choose a lane next to each of some lines, on the given side if possible.
 
-    At the edge of the AOD's band all go to the other side. If both edges are taken, the
-    lines up to a gap go down and those from there on up; there is a gap, since a batch never takes all lines.
+    At the edge of the AOD's band all go to the other side. If both edges are taken, the lines up to a gap go
+    down and the lines after it go up. There is always a gap, since a batch never takes all lines.
 
     Args:
         lines: int64 (n,), ascending.
         first: First line that the band reaches.
-        last: Last one.
+        last: Last line that the band reaches.
         side: 1 or -1, the side where they go if they can.
     """
     n = len(lines)
@@ -86,9 +86,10 @@ def find_lanes(lines: Ints, first: int, last: int, side: int) -> Floats:
 
 @helper_kernel()
 def lanes_of(tones: Tones, first: int, last: int) -> tuple[Floats, Floats]:
-    """Choose the lanes in which the tones of an axis leave, and those in which they arrive.
+    """Choose the lanes in which the tones of an axis leave and arrive.
 
-    They leave on the side to which most of the way goes, and arrive from it: on the same side if none moves.
+    They leave on the side to which most of the way goes, and arrive from it, or from the same side if none
+    moves.
     """
     total, moves = 0, False
     for i in range(len(tones[0])):
@@ -105,7 +106,7 @@ def add_knot(knots: Knots, row: Floats, column: Floats) -> Knots:
     """Add a knot, unless all tones are there already."""
     rows, columns, n_knots = knots
     moves = n_knots == 0
-    # loops, here and below: numba compiles them many times faster than assignments of whole arrays
+    # here and below, because numba compiles loops many times faster than assignments of whole arrays
     for i in range(len(row)):
         moves = moves or rows[n_knots - 1, i] != row[i]
         rows[n_knots, i] = row[i]
@@ -117,10 +118,10 @@ def add_knot(knots: Knots, row: Floats, column: Floats) -> Knots:
 
 @helper_kernel()
 def max_knots(n_rows: int, n_cols: int) -> int:
-    """More than the number of knots of any batch on a grid, lines outside of it included.
+    """More than the number of knots of any batch on a grid, including lines outside it.
 
-    Each site of the way along rows and columns takes PARTS, half a site more where tweezers go both ways,
-    and each row that is dropped off on its own 4.
+    Each site of the way along rows and columns takes PARTS knots, with half a site more where tweezers go
+    both ways. Each row that is dropped off on its own takes 4.
     """
     return PARTS * (n_rows + n_cols + 2) + 24
 
@@ -135,18 +136,18 @@ def swapped(knots: Knots) -> Knots:
 def add_travel(knots: Knots, to: Floats, lanes: Floats, weave: float) -> Knots:
     """Add the way of the row tones along the lanes of the column tones.
 
-    On a triangular lattice a straight lane is 0.43 spacings from the sites on both sides, while the
-    middles of the lattice's triangles and of their edges are 0.5 or more from all sites. So all tweezers
-    weave from one middle to the next: the lanes swing to and fro once in each site of the way. Tones that
-    wait, on the middle of an edge too, swing with them straight across that edge. Those that move are
-    shifted so that their tweezers, which the swing takes along the other axis, go evenly. Tones that move
-    the other way need the opposite swing, and so start half a site later.
+    On a triangular lattice a straight lane is 0.43 spacings from the sites on both sides, while the middles
+    of the lattice's triangles and of their edges are 0.5 or more from all sites. So all tweezers weave from
+    one middle to the next, and the lanes swing to and fro once in each site of the way. Waiting tones, which
+    may be on the middle of an edge, swing with them straight across that edge. Moving tones are shifted so
+    that their tweezers, which the swing takes along the other axis, go evenly. Tones that move the other way
+    need the opposite swing, and so start half a site later.
 
     Args:
-        knots: The knots so far; the column tones are in their lanes.
-        to: float64 (n,), where the row tones end, whole sites from where they are.
-        lanes: float64 (m,), where the column tones are.
-        weave: How far the lanes swing, in lines; below 0 on a lattice that is sheared the other way.
+        knots: The knots so far. The column tones are in their lanes.
+        to: float64 (n,), ends of the row tones, whole sites from their positions.
+        lanes: float64 (m,), positions of the column tones.
+        weave: How far the lanes swing, in lines. Below 0 on a lattice that is sheared the other way.
     """
     if weave == 0.0:
         return add_knot(knots, to, lanes)
@@ -180,10 +181,10 @@ def add_travel(knots: Knots, to: Floats, lanes: Floats, weave: float) -> Knots:
 
 @helper_kernel()
 def half_way(start: Floats, to: Floats, swing: float) -> Floats:
-    """Where tones are half-way through half a site, while those that wait swing out of the way.
+    """Positions of tones half-way through half a site, while waiting tones swing out of the way.
 
-    A tone in a lane goes as far as the other axis' tones, one on a line twice as far to the other side: both
-    straight away from the edge of a triangle that its tweezers are on.
+    A tone in a lane goes as far as the other axis' tones, and a tone on a line twice as far to the other
+    side. Both go straight away from the edge of the triangle that their tweezers are on.
     """
     at = np.empty(len(to))
     for i in range(len(to)):
@@ -196,7 +197,7 @@ def half_way(start: Floats, to: Floats, swing: float) -> Floats:
 
 @helper_kernel()
 def side_of(start: Floats, to: Floats) -> int:
-    """1 if tones move between a lane and the next higher line, -1 the next lower one, 0 neither, 2 both."""
+    """1 if tones move between a lane and the next higher line, -1 the next lower line, 0 neither, 2 both."""
     above = below = 0
     for i in range(len(to)):
         here = start[i]
@@ -208,7 +209,7 @@ def side_of(start: Floats, to: Floats) -> int:
 
 @helper_kernel()
 def are_apart(tones: Floats, first: int, last: int) -> bool:
-    """Whether the tones of an axis are within its band and at least half a line apart."""
+    """True if the tones of an axis are within its band and at least half a line apart."""
     apart = tones[0] >= first and tones[-1] <= last
     for i in range(1, len(tones)):
         apart = apart and tones[i] - tones[i - 1] >= LANE
@@ -217,9 +218,9 @@ def are_apart(tones: Floats, first: int, last: int) -> bool:
 
 @helper_kernel()
 def add_middle(knots: Knots, row: Floats, column: Floats, weave: float, band: Band, way: int) -> Knots:
-    """Add a knot half-way through half a site, unless tones are too near to one another there or too far out.
+    """Add a knot half-way through half a site, unless tones would be too close together or too far out.
 
-    ``way`` is the side to which tweezers on the edges go: 1 up along the rows, -1 down, 0 neither.
+    ``way`` is the side to which tweezers on the edges go, 1 up along the rows, -1 down, 0 neither.
     """
     last = knots[2] - 1
     at = half_way(knots[0][last], row, way * abs(weave))
@@ -233,7 +234,7 @@ def add_middle(knots: Knots, row: Floats, column: Floats, weave: float, band: Ba
 def add_half_site(knots: Knots, row: Floats, column: Floats, weave: float, band: Band) -> Knots:
     """Add a way of half a site from lanes to lines or back, by the middle of a triangle.
 
-    All tweezers are on middles of edges, or go from or to their sites; see :func:`add_travel`.
+    All tweezers are on middles of edges as in :func:`add_travel`, or go from or to their sites.
     """
     last = knots[2] - 1
     along, across = side_of(knots[0][last], row), side_of(knots[1][last], column)
@@ -252,11 +253,11 @@ def add_half_site(knots: Knots, row: Floats, column: Floats, weave: float, band:
 
 @helper_kernel()
 def next_to_put_down(carried: Bools, free: Bools, goes_off: Ints, together: Bools, used: Bools) -> None:
-    """Choose the rows that are dropped off together: those that leave no empty tweezer on an atom.
+    """Choose the rows to drop off together, which leave no empty tweezer on an atom.
 
     Args:
         carried: bool (n, m), which crossings carry atoms.
-        free: bool (n, m), which may be dropped off.
+        free: bool (n, m), which crossings may be dropped off.
         goes_off: int64 (n,), the knot at which each row is dropped off, 0 if it is still on.
         together: Result, bool (n,), the rows.
         used: Result, bool (m,), the columns that carry atoms in these rows.
@@ -287,19 +288,19 @@ def next_to_put_down(carried: Bools, free: Bools, goes_off: Ints, together: Bool
 def find_paths(
     rows: Tones, columns: Tones, crossings: tuple[Bools, Bools], band: Band, in_stages: bool, weave: float
 ) -> tuple[Floats, Floats, Ints]:
-    """Find the paths of the tones of a batch: the steps of the drawing above.
+    """Find the paths of the tones of a batch, by the steps of the drawing above.
 
     Args:
         rows: The row tones, n of them.
         columns: The column tones, m of them.
         crossings: bool (n, m) each, which crossings carry atoms, and which may be dropped off.
         band: The lines that the tones reach.
-        in_stages: Whether rows are dropped off in stages, so that only free crossings are dropped off.
-        weave: How far lanes swing, see :func:`add_travel`; 0 for straight ones.
+        in_stages: True to drop off rows in stages, so that only free crossings are dropped off.
+        weave: How far lanes swing, as in :func:`add_travel`, or 0 for straight lanes.
 
     Returns:
-        Positions of the row tones at each knot, float64 (n_knots, n), and of the column tones,
-        float64 (n_knots, m); the knot at which each row tone is ramped down, int64 (n,).
+        Positions of the row tones at each knot, float64 (n_knots, n), and of the column tones, float64
+        (n_knots, m), and the knot at which each row tone is ramped down, int64 (n,).
     """
     low, high, left, right = band
     n, m = len(rows[0]), len(columns[0])

@@ -1,4 +1,4 @@
-"""The kernel of the planner: batch after batch, the best of its candidates."""
+"""The kernel of the planner, which takes the best candidate for each batch."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from labseq_grid.kernels_rows import BAND, Batch, State, best_batch, find_neares
 GRID: Final = const("bool_", 2)
 
 Machine = tuple[tuple[int, int, int], int, bool, float, Costs]
-"""Maximum number of tweezers, row tones and column tones; lines beyond the grid that the tones reach on each
-side; whether a tweezer without an atom may be ramped down on an atom; how far lanes swing, see
-:func:`labseq_grid.kernels_paths.add_travel`; expected losses."""
+"""Maximum number of tweezers, row tones and column tones, lines beyond the grid that the tones reach on each
+side, True if an empty tweezer may be ramped down on an atom, the swing of lanes of
+:func:`labseq_grid.kernels_paths.add_travel`, and expected losses."""
 MACHINE: Final = f"Tuple((UniTuple(int64, 3), int64, boolean, float64, {COSTS}))"
 Sites = tuple[Bytes, Bytes, int]
-"""What each site holds (EMPTY, SPARE, STAYS or UNWANTED), and where an atom may be dropped off, both uint8;
-and how many lines outside of the grid they have on each side."""
+"""Content of each site (EMPTY, SPARE, STAYS or UNWANTED), and where an atom may be dropped off, both uint8,
+and their number of lines outside the grid on each side."""
 SITES: Final = "Tuple((uint8[:, ::1], uint8[:, ::1], int64))"
 Paths = tuple[NDArray[np.int32], Floats, NDArray[np.int32], int, int]
-"""path_shapes, path_positions and path_off of :class:`labseq.plugin.Plan`; how many of the last two."""
+"""path_shapes, path_positions and path_off of :class:`labseq.plugin.Plan`, and numbers of the last two."""
 PATHS: Final = "Tuple((int32[:, ::1], float64[::1], int32[::1], int64, int64))"
 
 
 @helper_kernel()
 def list_moves(batch: Batch) -> Ints:
-    """List the atom moves of a batch, int64 (n, 4): (row, column, to row, to column)."""
+    """List the atom moves of a batch, int64 (n, 4), as (row, column, to row, to column)."""
     swapped, rows, columns = batch
     moves = np.empty((rows.shape[1] * columns.shape[1], 4), np.int64)
     n = 0
@@ -59,7 +59,7 @@ def list_moves(batch: Batch) -> Ints:
 
 @helper_kernel()
 def paths_of(sites: Sites, machine: Machine, batch: Batch) -> tuple[Floats, Floats, Ints]:
-    """Find the paths of a batch's tones, see :func:`labseq_grid.kernels_paths.find_paths`."""
+    """Find the paths of a batch's tones by :func:`labseq_grid.kernels_paths.find_paths`."""
     kind, _, n_beside = sites
     _, slots, may_land, weave, _ = machine
     swapped, rows, columns = batch
@@ -67,7 +67,7 @@ def paths_of(sites: Sites, machine: Machine, batch: Batch) -> tuple[Floats, Floa
     used = np.empty(rows.shape[1], np.int64)
     for i in range(rows.shape[1]):
         for j in range(m):
-            if columns[0, j] >> i & 1:  # a row of which no column takes an atom needs no tone
+            if columns[0, j] >> i & 1:  # a row from which no column takes an atom needs no tone
                 used[n] = i
                 n += 1
                 break
@@ -91,7 +91,7 @@ def paths_of(sites: Sites, machine: Machine, batch: Batch) -> tuple[Floats, Floa
 
 @helper_kernel()
 def add_axis(paths: Paths, positions: Floats, goes_off: Ints) -> Paths:
-    """Add paths of the n tones of an axis, float64 (n_knots, n), and where each goes off, int64 (n,)."""
+    """Add paths of the n tones of an axis, float64 (n_knots, n), and knots at which they end, int64 (n,)."""
     shapes, all_positions, off, n_positions, n_off = paths
     stop, off_stop = n_positions + positions.size, n_off + len(goes_off)
     n_tones = len(goes_off)
@@ -107,7 +107,7 @@ def add_axis(paths: Paths, positions: Floats, goes_off: Ints) -> Paths:
 def add_batch(
     plan: GrowingPlan, paths: Paths, sites: Sites, machine: Machine, batch: Batch
 ) -> tuple[GrowingPlan, Paths]:
-    """Add a batch: its atom moves and the paths of its tones."""
+    """Add the atom moves of a batch and the paths of its tones."""
     row_path, column_path, goes_off = paths_of(sites, machine, batch)
     n_knots = len(row_path)
     stays_on = np.empty(column_path.shape[1], np.int64)
@@ -158,7 +158,7 @@ def view_of(kind: Bytes, vacant: Bytes, unavoidable: Floats, limits: Limits, cos
 
 @helper_kernel()
 def state_of(sites: Sites, machine: Machine, fills: bool, band: int) -> State:
-    """The state before the first batch; sources are all atoms to spare if batches fill vacancies."""
+    """The state before the first batch. Sources are all atoms to spare if batches fill vacancies."""
     kind, vacant, n_beside = sites
     limits, slots, _, _, costs = machine
     spread = 2 * (slots - n_beside) - 1  # a lane needs one line free
@@ -205,7 +205,7 @@ def carry_out(sites: Sites, state: State, moves: Ints, number: int) -> None:
 def add_batches(
     plan: GrowingPlan, paths: Paths, sites: Sites, machine: Machine, fills: bool
 ) -> tuple[GrowingPlan, Paths]:
-    """Add batches until no more atoms can be carried; updates ``sites``."""
+    """Add batches until no more atoms can be carried. Updates ``sites``."""
     widest, number = max(sites[0].shape), -1
     band = min(BAND, widest)
     state = state_of(sites, machine, fills, band)
@@ -215,7 +215,7 @@ def add_batches(
         if batch[2].shape[1] > 0:
             plan, paths = add_batch(plan, paths, sites, machine, batch)
             carry_out(sites, state, list_moves(batch), number)
-        elif band < widest:  # sources that are left may be further away
+        elif band < widest:  # remaining sources may be further away
             band = widest
             state = state_of(sites, machine, fills, band)
         else:
@@ -241,7 +241,7 @@ def read_sites(occupied: Bools, fill: Bools, clear: Bools, n_beside: int) -> Sit
 
 @helper_kernel()
 def open_reservoir(sites: Sites, kept_free: Bools) -> None:
-    """Let atoms be dropped off where there are none, except on the sites that are ``kept_free``."""
+    """Let atoms be dropped off on empty sites, except on the sites that are ``kept_free``."""
     kind, vacant, n_beside = sites
     vacant[:] = 0
     for row in range(kept_free.shape[0]):
@@ -252,7 +252,7 @@ def open_reservoir(sites: Sites, kept_free: Bools) -> None:
 
 @helper_kernel()
 def open_outside(sites: Sites) -> None:
-    """Let atoms be dropped off outside of the grid, and nowhere else."""
+    """Let atoms be dropped off outside the grid, and nowhere else."""
     _, vacant, n_beside = sites
     n_rows, n_cols = vacant.shape
     vacant[:] = 1
@@ -266,11 +266,11 @@ def open_outside(sites: Sites) -> None:
 def plan_grid(
     occupied: Bools, fill: Bools, wanted: Bools, clear: Bools, machine: Machine
 ) -> tuple[NDArray[np.generic], ...]:
-    """Plan all batches: fill vacancies, then bring unwanted atoms to the reservoir, then eject the rest.
+    """Plan all batches, to fill vacancies, then bring unwanted atoms to the reservoir, then eject the rest.
 
     Args:
         occupied: bool (n_rows, n_cols).
-        fill: The same shape, sites that must hold an atom; no more than there are atoms.
+        fill: The same shape, sites that must hold an atom, no more than there are atoms.
         wanted: The same shape, sites of the whole target.
         clear: The same shape, sites that must be empty.
         machine: See :data:`Machine`.

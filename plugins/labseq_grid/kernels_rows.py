@@ -1,9 +1,9 @@
 """Kernels that choose the rows of a batch.
 
 The *cost* of a batch is the number of atoms that it is expected to lose, for each vacancy that it fills. It
-is estimated for all pairs of a source row and a goal row, in both orientations, and worked out for those of
-lowest cost. As sites are used up, a cost only rises: so a pair is worked out again only when it comes
-first. From the best pairs on, rows are added while the cost falls.
+is estimated for all pairs of a source row and a goal row, in both orientations, and computed for the pairs of
+lowest cost. As sites are used up, a cost only rises, so a pair is computed again only when it comes first.
+Starting from the best pairs, rows are added while the cost falls.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ STARTS: Final = 3
 """Number of pairs of rows to which others are added."""
 # With 20 planning of 64 x 64 sites takes a third longer, and plans are as good.
 BAND: Final = 10
-"""Sources are no more columns from their goals, unless nothing else is left."""
-# This one and the three below shorten the search; they are chosen, not measured.
+"""Sources are at most this many columns from their goals, unless nothing else is left."""
+# This and the next three shorten the search. They are chosen, not measured.
 NEAR: Final = 4
-"""Rows that are added are no further from the source rows."""
+"""Rows that are added are at most this far from the source rows."""
 APART: Final = 1
-"""Ways of rows that are added differ by no more from that of the first row."""
+"""Ways of rows that are added differ by at most this from the way of the first row."""
 DEAREST: Final = 2.0
 """A pair of rows that costs more than this many times as much as the batch is not added to it."""
 RISE: Final = 1.3
@@ -46,13 +46,13 @@ NOWHERE: Final = 1 << 20
 """Distance where there is no atom."""
 
 Pairs = tuple[Floats, Ints, Floats, Ints, Ints]
-"""Pairs of rows of one orientation: cost, float64 (n_rows, n_rows), by source and goal; when it was found,
-int64, the same shape, see :func:`find_starts`; lowest cost for each source, float64 (n_rows,); number of the
-batch by which sources and vacancies of each row last changed, int64 (2, n_rows); distances of
-:func:`find_nearest`, int64 (n_rows, n_cols)."""
+"""Pairs of rows of one orientation, with the cost, float64 (n_rows, n_rows), by source and goal, the time
+when it was found as in :func:`find_starts`, int64, the same shape, the lowest cost for each source, float64
+(n_rows,), the number of the batch that last changed sources and vacancies of each row, int64 (2, n_rows), and
+distances of :func:`find_nearest`, int64 (n_rows, n_cols)."""
 PAIRS: Final = "Tuple((float64[:, ::1], int64[:, ::1], float64[::1], int64[:, ::1], int64[:, ::1]))"
 Batch = tuple[int, Ints, Ints]
-"""Orientation; source and goal rows, int64 (2, k); pattern, goal and source of each column, int64 (3, m)."""
+"""Orientation, source and goal rows, int64 (2, k), pattern, goal and source of each column, int64 (3, m)."""
 State = tuple[tuple[View, Pairs], tuple[View, Pairs]]
 """The grid and its pairs of rows, in both orientations."""
 STATE: Final = f"UniTuple(Tuple(({VIEW}, {PAIRS})), 2)"
@@ -75,7 +75,7 @@ def find_nearest(source: Bytes, row: int, nearest: Ints) -> None:
 
 @helper_kernel(f"float64({VIEW}, int64, int64, int64[:, ::1])")
 def estimate(view: View, row: int, to: int, nearest: Ints) -> float:
-    """Estimate the cost of a pair of rows as if each vacancy could have the atom that is nearest."""
+    """Estimate the cost of a pair of rows as if each vacancy could have its nearest atom."""
     (_, vacant, unavoidable), limits, costs, work = view
     n, passes = work[0], work[1]
     down, limit, furthest = abs(row - to), min(limits[0], limits[2]), -1
@@ -180,9 +180,9 @@ def insert_row(rows: Ints, k: int, row: int, to: int, longer: Ints) -> bool:
 
 @helper_kernel(f"float64({VIEW}, {PAIRS}, int64, int64, int64, int64[:, ::1])")
 def update_cost(view: View, pairs: Pairs, number: int, row: int, to: int, columns: Ints) -> float:
-    """Work out the cost of a pair of rows more precisely, in as many steps as it takes to be lowest.
+    """Compute the cost of a pair of rows more precisely, in as many steps as it takes to be lowest.
 
-    First it is estimated, then columns are chosen, at prices that rise until there is a choice.
+    It is estimated first. Then columns are chosen, at prices that rise until there is a choice.
     """
     cost, when, _, changed, nearest = pairs
     before, now = cost[row, to], 2 * number
@@ -213,16 +213,16 @@ def lowest(values: Floats) -> int:
 def find_starts(state: State, number: int, starts: Ints) -> int:
     """Find the pairs of rows of lowest cost.
 
-    A cost that was estimated before batch i is marked with 2 i, one that was worked out with 2 i + 1. It
-    holds until a site of the two rows changes.
+    A cost that was estimated before batch i is marked with 2 i, and a computed cost with 2 i + 1. It holds
+    until a site of the two rows changes.
 
     Args:
         state: The state before the batch.
         number: Number of the batch.
-        starts: Result, int64 (n, 3): orientation, source row and goal row.
+        starts: Result, int64 (n, 3), orientation, source row and goal row.
 
     Returns:
-        How many are found.
+        The number of pairs.
     """
     columns, found = np.empty((3, len(state[0][0][3][0])), np.int64), np.empty(len(starts))
     n = 0
@@ -238,7 +238,7 @@ def find_starts(state: State, number: int, starts: Ints) -> int:
             break
         if when[row, to] % 2 == 1 and when[row, to] // 2 > max(changed[0, row], changed[1, to]):
             starts[n, 0], starts[n, 1], starts[n, 2], found[n] = a, row, to, cost[row, to]
-            set_cost(pairs, row, to, np.inf)  # until all are found
+            set_cost(pairs, row, to, np.inf)  # until all pairs are found
             n += 1
         else:
             set_cost(pairs, row, to, update_cost(view, pairs, number, row, to, columns))
@@ -256,7 +256,7 @@ def best_batch(state: State, number: int) -> Batch:
         number: Its number.
 
     Returns:
-        The batch; without columns if there is none.
+        The batch, without columns if there is none.
     """
     starts = np.empty((STARTS, 3), np.int64)
     best, orientation, best_k, best_m = np.inf, 0, 0, 0

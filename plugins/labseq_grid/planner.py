@@ -1,4 +1,4 @@
-"""The planner and its settings; the algorithm itself is in the kernels."""
+"""The planner and its settings. The algorithm is in the kernels."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ class GridSettings(Settings):
     degree_of_parallelism: int = Field(
         default=15,
         ge=1,
-        description="maximum number of mobile tweezers on at once, those without an atom included; the "
-        "profile's limits hold too",
+        description="maximum number of mobile tweezers on at once, including empty ones; the "
+        "profile's limits also apply",
     )
     lanes: Literal["straight", "weaving"] = Field(
         default="weaving",
-        description="weaving: around the atoms of a triangular lattice, which loses fewer of them; straight: "
-        "tone programs of fewer segments, as on a square lattice",
+        description="'weaving' goes around the atoms of a triangular lattice and loses fewer; 'straight' has "
+        "tone programs with fewer segments, as on a square lattice",
     )
     without_lanes: Literal["refuse", "psca"] = Field(
         default="refuse",
-        description="what happens if the profile's clearance, band or tones leave no lane between the sites: "
-        "refuse: an error; psca: batches of single lines, by the planner psca",
+        description="behaviour if the profile's clearance, band or tones leave no lane between the sites; "
+        "'refuse' is an error, 'psca' makes batches of single lines with the planner psca",
     )
 
 
 OUTERMOST: Final = 0.61
-"""How far beyond the last line of sites a tone in a lane goes, in lines: half a line, and the swing."""
+"""How far beyond the last line of sites a tone in a lane goes, in lines (half a line and the swing)."""
 
 
 def lane_m(grid: SiteGrid) -> float:
@@ -74,7 +74,7 @@ def check_lanes(grid: SiteGrid, motion: MotionSpec) -> None:
         raise LimitError(
             "the number of ejection slots",
             0,
-            "at least 1 where the grid has a single line, for a lane",
+            "at least 1, because a grid with a single line needs a lane",
             f"raise mobile_tweezers.eject_slots in the profile, or {OTHERWISE}",
         )
     axes = (("row", grid.row_frequency_hz), ("column", grid.column_frequency_hz))
@@ -83,15 +83,15 @@ def check_lanes(grid: SiteGrid, motion: MotionSpec) -> None:
             _check_tones(axis, np.sort(hz), band, motion)
 
 
-OTHERWISE: Final = "choose a planner of line batches such as psca, or `without_lanes: psca` for this one"
+OTHERWISE: Final = "choose a planner of line batches such as psca, or set `without_lanes: psca`"
 
 
 def _check_tones(axis: str, hz: NDArray[np.float64], band: tuple[float, float], motion: MotionSpec) -> None:
-    """Raise a LimitError if tones in lanes are too near to those on lines, or out of the band."""
+    """Raise a LimitError if tones in lanes are too near to tones on lines, or out of the band."""
     half_hz = float(np.diff(hz).min()) / 2
     if not motion.empty_tweezers_may_land and half_hz < motion.rf.min_spacing_hz * (1 - 1e-9):
         raise LimitError(
-            f"the distance of a {axis} tone in a lane from one on the next line",
+            f"the distance of a {axis} tone in a lane from a tone on the next line",
             f"{half_hz / 1e6:.6g} MHz",
             f"{motion.rf.min_spacing_hz / 1e6:.6g} MHz at least",
             f"lower mobile_tweezers.rf.min_spacing in the profile, or {OTHERWISE}",
@@ -103,16 +103,16 @@ def _check_tones(axis: str, hz: NDArray[np.float64], band: tuple[float, float], 
             f"the frequency of a {axis} tone in the outermost lane",
             f"{outside / 1e6:.6g} MHz",
             f"the band of {band[0] / 1e6:.6g} to {band[1] / 1e6:.6g} MHz",
-            f"set mobile_tweezers.eject_slots: 0 in the profile, for no lane beyond the grid, or {OTHERWISE}",
+            f"set mobile_tweezers.eject_slots to 0 in the profile to avoid outer lanes, or {OTHERWISE}",
         )
 
 
 WEAVE: Final = 0.11
-"""How far a lane of the triangular lattice swings, in lines: tweezers so keep about 2.2 um from atoms."""
+"""Swing of a lane of the triangular lattice, in lines, so that tweezers keep about 2.2 um from atoms."""
 
 
 def lane_weave(grid: SiteGrid, motion: MotionSpec) -> float:
-    """How far lanes swing: 0 on a square lattice, and where each leg starts and ends at rest."""
+    """How far lanes swing. 0 on a square lattice, and if each leg starts and ends at rest."""
     if motion.speed_profile != "constant":
         return 0.0
     a1, a2 = grid.axes / grid.spacing_m
@@ -121,22 +121,22 @@ def lane_weave(grid: SiteGrid, motion: MotionSpec) -> float:
 
 # Chosen from plans for square lattices of 20 x 20 to 100 x 100 sites, see docs/explanation/grid-planner.md.
 TIME: Final = 8.0
-"""How many times the atoms count that are lost while a batch lasts: short plans are worth more than these."""
+"""Weight of the atoms lost while a batch lasts, because short plans are worth more than these."""
 WOVEN: Final = 0.49
-"""How near tweezers in a lane that weaves come to atoms, in spacings; the middles of the edges are at 0.5."""
+"""How near tweezers in a weaving lane come to atoms, in spacings. The middles of the edges are at 0.5."""
 
 
 def batch_costs(
     occupied: Occupancy, has_unwanted: bool, grid: SiteGrid, motion: MotionSpec, weave: float
 ) -> tuple[float, float, float, float, float]:
-    """Expected losses that a batch causes, see :data:`labseq_grid.kernels_columns.Costs`, in atoms.
+    """Expected losses that a batch causes, as :data:`labseq_grid.kernels_columns.Costs`, in atoms.
 
     Args:
         occupied: bool (n_rows, n_cols).
-        has_unwanted: Whether there are atoms on sites that must be empty.
+        has_unwanted: True if there are atoms on sites that must be empty.
         grid: The grid.
         motion: Its ramps, speed and losses.
-        weave: How far lanes swing, see :func:`lane_weave`.
+        weave: How far lanes swing, from :func:`lane_weave`.
     """
     losses, n_atoms = motion.losses, int(np.count_nonzero(occupied))
     hazard = pass_hazard(motion, lane_m(grid) if weave == 0 else WOVEN * grid.spacing_m)
@@ -153,19 +153,19 @@ def batch_costs(
 
 
 class GridPlanner:
-    """Rows x columns of reservoir atoms go straight to vacancies, through lanes between the sites.
+    """Moves rows x columns of reservoir atoms directly to vacancies, through lanes between the sites.
 
     Args:
         settings: The planner's settings.
-        context: Its grid determines the lanes and which sites are nearest to the target's
-            centre; its motion limits tweezers and tones, and how far out atoms can be ejected.
+        context: Its grid determines the lanes and which sites are nearest to the target's centre. Its motion
+            limits tweezers and tones, and how far out atoms can be ejected.
 
     Attributes:
         degree_of_parallelism: Maximum number of tweezers on at once.
 
     Raises:
-        LimitError: There is no lane in which tweezers keep the clearance, or whose tones can be played, and
-            the settings want no line batches instead.
+        LimitError: There is no lane in which tweezers keep the clearance and whose tones can be played, and
+            the settings do not allow line batches instead.
 
     Example:
         >>> target = TargetPattern(fill=[[True, True, False]], clear=[[False, False, False]])

@@ -1,8 +1,8 @@
-"""Points by a sampler of Optuna, as a pure function of the visited points.
+"""Chooses points by a sampler of Optuna, as a pure function of the visited points.
 
-Optuna's own samplers go on drawing from where they stand. Here each point has a sampler of its
-own, seeded by the run's seed and the number of points before it, and a study that is given
-everything from the start; so a run that is resumed asks for the same points.
+Optuna's own samplers keep their state from draw to draw. Here each point has its own sampler, seeded by the
+run's seed and the number of points before it, and a study that is given everything from the start. So a
+resumed run asks for the same points.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from labseq.plugin.messages import install_hint
 
 
 class OptunaSettings(Settings):
-    """Which sampler, and how it begins."""
+    """The sampler, and how it starts."""
 
     sampler: Literal["tpe", "random"] = Field(
         default="tpe",
@@ -45,7 +45,7 @@ class OptunaScanner:
         self._distributions = {one.address: self._distribution(one) for one in space.ranges}
 
     def next_point(self, visited: Sequence[VisitedPoint]) -> Mapping[str, float]:
-        """The point of the files first, if known; then the points of the sampler."""
+        """The point of the files first, if known, then the points of the sampler."""
         if not visited and all(not math.isnan(one.start) for one in self._space.ranges):
             return {one.address: one.at(one.fraction(one.start)) for one in self._space.ranges}
         optuna = self._optuna
@@ -64,7 +64,7 @@ class OptunaScanner:
             return samplers.TPESampler(seed=seed, n_startup_trials=self._settings.n_random, multivariate=True)
 
     def _distribution(self, one: ScanRange) -> Any:
-        """A range with steps counts them; any other goes from 0 to 1."""
+        """A range with steps counts them. Any other range goes from 0 to 1."""
         if one.is_whole or one.n_steps:
             return self._optuna.distributions.IntDistribution(0, _n_steps(one))
         return self._optuna.distributions.FloatDistribution(0.0, 1.0)
@@ -85,12 +85,12 @@ class OptunaScanner:
 
 
 def _n_steps(one: ScanRange) -> int:
-    """Number of steps of a range; 1 where any value will do."""
+    """Number of steps of a range, or 1 if any value is allowed."""
     return one.n_steps or (int(one.high - one.low) if one.is_whole else 1)
 
 
 def _optuna() -> Any:
-    """Optuna, quiet.
+    """Optuna with its log switched off.
 
     Raises:
         ConfigError: It is not installed.
@@ -98,7 +98,7 @@ def _optuna() -> Any:
     try:
         optuna = importlib.import_module("optuna")
     except ImportError as error:
-        text = f"the scanner 'optuna' needs the package of that name ({error})"
+        text = f"the scanner 'optuna' needs the package 'optuna' ({error})"
         raise ConfigError(f"{text}; install it with {install_hint('optuna')}") from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna

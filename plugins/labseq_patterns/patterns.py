@@ -17,11 +17,13 @@ Index: TypeAlias = Annotated[int, Field(ge=0)]
 """Index of a row or a column, from 0."""
 Origin: TypeAlias = Annotated[
     tuple[Index, Index] | None,
-    Field(description="[row, column] of the block's top left site, from 0; centred if left out"),
+    Field(description="[row, column] of the block's top left site, from 0; centred by default"),
 ]
 Clear: TypeAlias = Annotated[
     Literal["bounding_box", "none"],
-    Field(description="bounding_box: all other sites of the block must be empty; none: they are reservoir"),
+    Field(
+        description="with 'bounding_box' all other block sites must be empty; with 'none' they are reservoir"
+    ),
 ]
 
 
@@ -45,13 +47,14 @@ class SierpinskiSettings(Settings):
     """
 
     order: Annotated[int, Field(ge=0, le=12)] | None = Field(
-        default=None, description="how often the triangle is divided; order n takes 2^n rows and columns"
+        default=None,
+        description="number of divisions of the triangle, where order n takes 2^n rows and columns",
     )
     rows: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, description="rows of the block, counted from the tip; instead of the order"
+        default=None, description="rows of the block, counted from the tip, instead of the order"
     )
     cols: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, description="columns of the block, counted from the tip; instead of the order"
+        default=None, description="columns of the block, counted from the tip, instead of the order"
     )
     origin: Origin = None
     clear: Clear = "bounding_box"
@@ -72,7 +75,7 @@ class SierpinskiSettings(Settings):
 
 
 class RingSettings(Settings):
-    """A ring, of a radius or as large as fits into a block.
+    """A ring with a given radius, or as large as fits into a block.
 
     Example:
         >>> RingSettings(radius=6).width
@@ -83,15 +86,15 @@ class RingSettings(Settings):
         default=None, description="outer radius, in units of the spacing of the sites"
     )
     rows: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, description="rows of the block that the ring fits into; instead of the radius"
+        default=None, description="rows of the block that the ring fits into, instead of the radius"
     )
     cols: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, description="columns of the block that the ring fits into; instead of the radius"
+        default=None, description="columns of the block that the ring fits into, instead of the radius"
     )
     width: float = Field(
         default=2.0,
         ge=1,
-        description="how thick the ring is, in units of the spacing; beyond the radius it is a full disc",
+        description="thickness of the ring, in units of the spacing; above the radius it is a full disc",
     )
     origin: Origin = None
     clear: Clear = "bounding_box"
@@ -106,13 +109,13 @@ def check_one_size(name: str, value: float | None, rows: int | None, cols: int |
     """Refuse a pattern with no size, half a size or two sizes.
 
     Args:
-        name: Name of the setting that stands for rows and columns.
+        name: Name of the setting that replaces rows and columns.
         value: Its value.
         rows: Rows of the block.
         cols: Columns of the block.
 
     Raises:
-        ValueError: With what was expected.
+        ValueError: The size is missing or ambiguous. The message says what was expected.
     """
     n_given = (rows is not None) + (cols is not None)
     if n_given == (2 if value is None else 0):
@@ -122,18 +125,18 @@ def check_one_size(name: str, value: float | None, rows: int | None, cols: int |
 
 
 def checkerboard(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
-    """Every other site of each row and column, the top left one included.
+    """Every other site of each row and column, including the top left site.
 
-    On a square grid that is a square lattice of sqrt(2) times the spacing, turned
-    by 45 degrees. A triangular lattice has no checkerboard: there the sites of each
-    diagonal line stay together, and lines with and without atoms take turns.
+    On a square grid this is a square lattice of sqrt(2) times the spacing, turned by 45 degrees. A triangular
+    lattice has no checkerboard. There the sites of each diagonal line stay together, and lines with and
+    without atoms alternate.
 
     Args:
         settings: Size and place.
         grid: Any grid.
 
     Raises:
-        LimitError: The block is larger than the grid or sticks out of it.
+        LimitError: The block is larger than the grid or extends beyond it.
 
     Example:
         >>> grid = SiteGrid(2, 3, lattice="square")
@@ -153,44 +156,43 @@ Mask: TypeAlias = NDArray[np.bool_]
 def diluted(
     name: str, settings: BlockSettings, grid: SiteGrid, keep: Callable[[Ints, Ints], Mask]
 ) -> TargetPattern:
-    """A block of a triangular lattice, of which only some sites hold atoms.
+    """A block of a triangular lattice in which only some sites hold atoms.
 
     Args:
         name: Name of the pattern.
         settings: Size and place.
         grid: A triangular grid.
-        keep: Says of the sites' rows and columns, counted from the block's top left site, which of
-            them hold an atom.
+        keep: Takes the sites' rows and columns, counted from the block's top left site, and says which hold
+            an atom.
 
     Raises:
         ConfigError: The grid is square.
-        LimitError: The block is larger than the grid or sticks out of it.
+        LimitError: The block is larger than the grid or extends beyond it.
     """
-    if grid.lattice != "triangular":  # on which it would be another lattice
+    if grid.lattice != "triangular":  # it would be another lattice on a square grid
         raise ConfigError(
             Problem(
-                f"the pattern '{name}' dilutes a triangular lattice, and the grid is {grid.lattice}",
+                f"the pattern '{name}' dilutes a triangular lattice, but the grid is {grid.lattice}",
                 expected="a profile with 'lattice: triangular'",
-                hint="draw what you mean with the pattern 'bitmap'",
+                hint="draw your target with the pattern 'bitmap'",
             )
         )
     mask = keep(*block(settings.rows, settings.cols, grid.shape))
-    if grid.shear < 0:  # the array of atoms is the mirror image then, too
+    if grid.shear < 0:  # then the array of atoms is also the mirror image
         mask = mask[:, ::-1]
     title = f"{name.replace('_', '-')} {settings.rows} x {settings.cols}"
     return pattern(mask, grid, origin=settings.origin, clear=settings.clear, name=title)
 
 
 def honeycomb(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
-    """The honeycomb lattice: a third of the triangular lattice's sites is left out.
+    """The honeycomb lattice, which leaves out a third of the triangular lattice's sites.
 
-    The three sublattices of the triangular lattice are row - column modulo 3; left
-    out is the one of the block's top left site (its top right site with
-    ``shear: -1``). In a block with as many rows as columns the two acute corners
-    are empty; if that number is 3 n or 3 n + 1, no atom hangs on by a single
+    The three sublattices of the triangular lattice are row - column modulo 3. The sublattice of the block's
+    top left site is left out (its top right site with ``shear: -1``). In a block with as many rows as columns
+    the two acute corners are empty. If that number is 3 n or 3 n + 1, each atom has more than a single
     neighbour. In the bulk each atom has 3 nearest neighbours.
 
-    Arguments and errors are those of :func:`diluted`.
+    Arguments and errors are as for :func:`diluted`.
 
     Example:
         >>> honeycomb(BlockSettings(rows=3, cols=3), SiteGrid(3, 3)).fill.astype(int).tolist()
@@ -200,13 +202,13 @@ def honeycomb(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
 
 
 def kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
-    """The kagome lattice: a quarter of the triangular lattice's sites is left out.
+    """The kagome lattice, which leaves out a quarter of the triangular lattice's sites.
 
-    The unit cell is 2 x 2 sites with 3 atoms; in the bulk each atom has 4 nearest
-    neighbours. Left out are the odd rows' odd sites, counted from 0 at the top
-    left (at the top right with ``shear: -1``): the block's edges are full lines.
+    The unit cell is 2 x 2 sites with 3 atoms. In the bulk each atom has 4 nearest neighbours. The odd sites
+    of odd rows are left out, counted from 0 at the top left (at the top right with ``shear: -1``), so the
+    block's edges are full lines.
 
-    Arguments and errors are those of :func:`diluted`.
+    Arguments and errors are as for :func:`diluted`.
 
     Example:
         >>> kagome(BlockSettings(rows=3, cols=3), SiteGrid(3, 3)).fill.astype(int).tolist()
@@ -218,16 +220,14 @@ def kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
 def link_kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
     """One atom on every link of a kagome lattice, also called ruby lattice.
 
-    The sites of even row and even column make a triangular lattice of twice the
-    spacing; with every fourth of them left out it is a kagome lattice. Atoms sit
-    halfway between its neighbours, so a block of (2 m - 1) x (2 n - 1) sites holds
-    the links of m x n sites of the pattern ``kagome``. The unit cell is 4 x 4 sites
-    with 6 atoms. In the bulk each atom has 2 neighbours at one spacing a (the
-    triangles of the kagome lattice), 2 at sqrt(3) a and 2 at 2 a: the six other
-    links at the ends of its link, as in Semeghini et al., "Probing topological
-    spin liquids on a programmable quantum simulator", Science 374, 1242 (2021).
+    The sites of even row and even column make a triangular lattice of twice the spacing. Without every fourth
+    of these it is a kagome lattice. Atoms sit halfway between its neighbours, so a block of (2 m - 1) x (2 n
+    - 1) sites holds the links of m x n sites of the pattern ``kagome``. The unit cell is 4 x 4 sites with 6
+    atoms. In the bulk each atom has 2 neighbours at one spacing a (the triangles of the kagome lattice), 2 at
+    sqrt(3) a and 2 at 2 a. These are the six other links at the ends of its link, as in Semeghini et al.,
+    "Probing topological spin liquids on a programmable quantum simulator", Science 374, 1242 (2021).
 
-    Arguments and errors are those of :func:`diluted`.
+    Arguments and errors are as for :func:`diluted`.
 
     Example:
         >>> target = link_kagome(BlockSettings(rows=3, cols=4), SiteGrid(3, 4))
@@ -238,7 +238,7 @@ def link_kagome(settings: BlockSettings, grid: SiteGrid) -> TargetPattern:
 
 
 def _is_on_a_link(row: Ints, col: Ints) -> Mask:
-    """Both ends of a link are kagome sites: not both of their coordinates, halved, are odd."""
+    """True if both ends are kagome sites, which do not have two odd coordinates after halving."""
     odd_row, odd_col = row % 2 == 1, col % 2 == 1
     along_row = (row % 4 == 0) & odd_col
     along_column = odd_row & (col % 4 == 0)
@@ -252,18 +252,17 @@ _ROUNDING: Final = 1e-9
 def ring(settings: RingSettings, grid: SiteGrid) -> TargetPattern:
     """The sites between two circles about the middle of the block, on any grid.
 
-    Sites on the outer circle belong to the ring, those on the inner one do not: on
-    a triangular grid ``radius: 1, width: 1`` is a hexagon of 6 atoms. With ``rows``
-    and ``cols`` the outer circle is the largest one within the block's outermost
-    lines of sites; with ``radius`` the block is the smallest with a site in its
-    middle that holds the circle.
+    Sites on the outer circle belong to the ring, but not sites on the inner circle, so on a triangular grid
+    ``radius: 1, width: 1`` is a hexagon of 6 atoms. With ``rows`` and ``cols`` the outer circle is the
+    largest circle within the block's outermost lines of sites. With ``radius`` the block is the smallest with
+    a site in its middle that contains the circle.
 
     Args:
         settings: Size and place.
         grid: Any grid.
 
     Raises:
-        LimitError: The block is larger than the grid or sticks out of it.
+        LimitError: The block is larger than the grid or extends beyond it.
 
     Example:
         >>> target = ring(RingSettings(radius=1, width=1), SiteGrid(3, 3))
@@ -291,20 +290,19 @@ def ring(settings: RingSettings, grid: SiteGrid) -> TargetPattern:
 
 
 def sierpinski(settings: SierpinskiSettings, grid: SiteGrid) -> TargetPattern:
-    """The odd numbers of Pascal's triangle, tip up: 3^n atoms in 2^n rows.
+    """The odd numbers of Pascal's triangle, tip up, with 3^n atoms in 2^n rows.
 
-    On a triangular grid the triangle is equilateral: its tip is the block's top
-    right site (the top left one with ``shear: -1``), its base the whole lowest row.
-    On a square grid it has a right angle at the lower left, below its tip. A block
-    that is not a power of two is a larger triangle, cut below or at the side away
-    from the tip.
+    On a triangular grid the triangle is equilateral. Its tip is the block's top right site (top left with
+    ``shear: -1``), and its base is the whole lowest row. On a square grid it has a right angle at the lower
+    left, below its tip. A block that is not a power of two is a larger triangle, cut below or at the side
+    away from the tip.
 
     Args:
         settings: Size and place.
         grid: Any grid.
 
     Raises:
-        LimitError: The block is larger than the grid or sticks out of it.
+        LimitError: The block is larger than the grid or extends beyond it.
 
     Example:
         >>> grid = SiteGrid(4, 4, shear=-1)

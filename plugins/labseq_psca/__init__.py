@@ -17,7 +17,7 @@ def labseq_register(registry: Registry) -> None:
     """Offer the planners ``psca`` and ``repair``."""
 
     def repair(settings: RepairSettings, context: Context) -> RepairPlanner:
-        """Another planner, but few defects are filled with few atom moves where that loses fewer atoms."""
+        """Uses another planner, but fills few defects with few atom moves if that loses fewer atoms."""
         from labseq_psca.repair import RepairPlanner, construct_other
 
         return RepairPlanner(settings, context, construct_other(registry, settings.after, context))

@@ -1,11 +1,10 @@
-"""Kernels of the generalised PSCA: row sorts that help all columns, both orientations compared.
+"""Kernels of the generalised PSCA, which sorts rows to help all columns and compares both orientations.
 
-Its plans have fewer batches than those of the paper's text, which is :mod:`labseq_psca.kernels_paper`.
+Its plans have fewer batches than :mod:`labseq_psca.kernels_paper`, which follows the paper's text.
 
-Everything is written for row sorting and then column compression; the other
-orientation is the same on the transposed grid. The vocabulary is that of
-:mod:`labseq_psca.kernels_lines`. ``need``, ``room`` and ``count``, int64 (n_cols,), are
-the fill sites of each column, its sites that may hold an atom, and its atoms now.
+Everything is written for row sorting and then column compression. The other orientation is the same on the
+transposed grid. Names are as in :mod:`labseq_psca.kernels_lines`. ``need``, ``room`` and ``count``, int64
+(n_cols,), are the fill sites of each column, its sites that may hold an atom, and its atoms now.
 """
 
 from __future__ import annotations
@@ -37,33 +36,33 @@ from labseq_psca.kernels_lines import (
     sort_row,
 )
 
-# What changes are worth, in units of one atom moved: docs/explanation/psca.md, "Choices".
-NEED: Final = 80  # for an atom in a column that lacks one: this plus the number of columns, times its lack,
+# Worth of changes in units of one atom moved, see docs/explanation/psca.md, "Choices".
+NEED: Final = 80  # for an atom in a column that lacks atoms, this plus the number of columns, times its lack,
 LACK_COUNTS: Final = 8  # which counts up to here
-TARGET_COLUMN: Final = 20  # less for an atom that leaves a column with fill sites
-ON_TARGET: Final = 10  # more for an atom that lands on a fill site, less for one that leaves it
+TARGET_COLUMN: Final = 20  # subtracted for an atom that leaves a column with fill sites
+ON_TARGET: Final = 10  # added for an atom that lands on a fill site, subtracted if it leaves a fill site
 EFFORT: Final = 240  # columns looked at closely for each choice, but no fewer than
-ROWS_TRIED: Final = 3  # so many rows; more hardly helps
+ROWS_TRIED: Final = 3  # number of rows, more hardly helps
 PLACES: Final = 1 << 20  # more than twice any place in an order
 PER_BATCH: Final = 1000  # worth per batch is compared in integers, in thousandths
 
 Work = tuple[Ints, NDArray[np.int8], Ints, Ints]
-"""int64 (> n_cols,) and int8 (n_cols, > n_cols) for an exchange; int64 (3, n_cols) and (n_rows,)."""
+"""int64 (> n_cols,) and int8 (n_cols, > n_cols) for an exchange, and int64 (3, n_cols) and (n_rows,)."""
 
 
 @helper_kernel()
 def weigh_columns(need: Ints, room: Ints, count: Ints, weight: Ints, leave: Ints) -> int:
-    """Work out what one atom more or less is worth to each column.
+    """Compute the worth of an atom more or less for each column.
 
     Args:
-        need: See the module, as for ``room`` and ``count``.
+        need: See the module, also for ``room`` and ``count``.
         room: See there.
         count: See there.
-        weight: Result, int64 (n_cols,): worth of one more; 0 if it lacks none.
-        leave: Result, int64 (n_cols,): cost of one less; -1 if it can spare none.
+        weight: Result, int64 (n_cols,), worth of one atom more, 0 if it lacks none.
+        leave: Result, int64 (n_cols,), cost of one atom less, -1 if it can spare none.
 
     Returns:
-        How many atoms the columns lack in all.
+        Number of atoms that all columns lack.
     """
     n_lacking = 0
     for col in range(len(need)):
@@ -80,10 +79,10 @@ def weigh_columns(need: Ints, room: Ints, count: Ints, weight: Ints, leave: Ints
 
 @helper_kernel()
 def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, order: int, rank: Ints) -> None:
-    """Bound from above what sorting each row is worth per batch.
+    """Compute an upper bound for the worth of sorting each row, per batch.
 
-    The result, int64 (n_rows,), is the bound times PLACES, plus more for rows that are first in the
-    order; 0 for rows that cannot help. ``weight`` and ``leave`` are those of :func:`weigh_columns`.
+    The result, int64 (n_rows,), is the bound times PLACES, plus more for rows that come first in the order,
+    or 0 for rows that cannot help. ``weight`` and ``leave`` come from :func:`weigh_columns`.
     """
     n_rows, n_cols = atoms.shape
     for row in range(n_rows):
@@ -107,19 +106,18 @@ def rank_rows(atoms: Bools, weight: Ints, leave: Ints, limit: int, order: int, r
 
 @helper_kernel()
 def best_exchange(atoms: Bools, gain: Ints, cost: Ints, work: Work, change: Ints) -> int:
-    """Find the atoms of a row that had best leave their columns, and the vacancies to fill.
+    """Find the atoms of a row that should leave their columns, and the vacancies to fill.
 
-    The order is kept, so atoms between a leaver and a filled vacancy shift by one
-    place each: atoms move that leave, or whose balance (leavers minus filled
-    vacancies to their left) is not zero. A dynamic programme over columns and
-    balances finds the exchange that is worth most; it looks only at balances that
-    can come about and can be evened out again.
+    The order is kept, so atoms between a leaver and a filled vacancy shift by one place each. An atom moves
+    if it leaves, or if its balance (leavers minus filled vacancies to its left) is not zero. A dynamic
+    programme over columns and balances finds the exchange of highest worth. It looks only at balances that
+    can occur and can return to zero.
 
     Args:
         atoms: bool (n,), the row.
-        gain: int64 (n,), worth of filling a vacancy; 0 where it is not wanted.
-        cost: int64 (n,), cost of an atom's leaving; -1 where it must stay.
-        work: The work space.
+        gain: int64 (n,), worth of filling a vacancy, 0 where it is not wanted.
+        cost: int64 (n,), cost of an atom's leaving, -1 where it must stay.
+        work: Scratch arrays.
         change: Result, int64 (n,), the exchange.
 
     Returns:
@@ -187,7 +185,7 @@ def choose_row(
 ) -> int:
     """Choose the row whose sorting helps most per batch, and find its exchange.
 
-    Rows are looked at closely in the order of their bounds, until no bound is above the best worth.
+    Rows are examined in the order of their bounds, until no bound is above the best worth.
 
     Returns:
         The row, or -1 if no row helps.
@@ -224,7 +222,7 @@ def choose_row(
 def sort_rows(
     plan: GrowingPlan, atoms: Bools, fill: Bools, clear: Bools, limit: int, order: int
 ) -> GrowingPlan:
-    """Sort rows until every column holds at least as many atoms as it has fill sites; updates ``atoms``."""
+    """Sort rows until every column has at least as many atoms as fill sites. Updates ``atoms``."""
     n_rows, n_cols = atoms.shape
     need, room, count = column_sums(fill), n_rows - column_sums(clear), column_sums(atoms)
     weight = np.empty(n_cols, np.int64)
@@ -250,7 +248,7 @@ def sort_rows(
 
 @helper_kernel(f"int64({GRID}, {GRID}, {GRID}, int64)")
 def least_batches(atoms: Bools, fill: Bools, clear: Bools, limit: int) -> int:
-    """Count the batches that the compression of all columns takes at least, after row sorting."""
+    """Minimum number of batches for the compression of all columns, after row sorting."""
     n_rows, n_cols = atoms.shape
     vacant = np.zeros(n_cols, np.int64)
     surplus = np.zeros(n_cols, np.int64)
@@ -298,10 +296,10 @@ def finished_swapped(plan: GrowingPlan) -> FinishedPlan:
 def plan_fewest(
     occupied: Bools, fill: Bools, clear: Bools, row_limit: int, column_limit: int, slots: int, order: int
 ) -> FinishedPlan:
-    """Plan both orientations and keep the plan of fewer batches, then atom moves, then distance.
+    """Plan both orientations and keep the plan with fewer batches, then atom moves, then distance.
 
-    The orientation that promises fewer batches after sorting is completed first; the
-    other one only if it can still be as good.
+    The orientation that promises fewer batches after sorting is completed first, and the other only if it can
+    still be as good.
 
     Args:
         occupied: bool (n_rows, n_cols), no fewer atoms than fill sites.
@@ -310,7 +308,7 @@ def plan_fewest(
         row_limit: Maximum number of atoms in a batch that moves along a row.
         column_limit: Maximum number of atoms in a batch that moves along a column.
         slots: Ejection slots on each side.
-        order: Which of equal rows goes first, see :func:`labseq_psca.kernels_lines.place_in_order`.
+        order: Which of equal rows goes first, as in :func:`labseq_psca.kernels_lines.place_in_order`.
     """
     atoms = occupied.copy()
     other_atoms, other_fill, other_clear = transposed(occupied), transposed(fill), transposed(clear)

@@ -1,12 +1,11 @@
-"""Kernels of the two steps that both variants of PSCA share: a row is sorted, columns are compressed.
+"""Kernels of row sorting and column compression, the steps that both variants of PSCA share.
 
-In all kernels ``atoms`` marks the sites that hold an atom, ``fill`` those that must
-hold one and ``clear`` those that must be empty: bool (n_rows, n_cols), or (n_sites,)
-for a line. ``limit`` is the maximum number of atoms in a batch, and ``slots`` the
-number of ejection slots on each side. ``source`` and ``goal`` are those of
-:mod:`labseq.plugin.plan_kernels`. ``change``, int64 (n_cols,), is an exchange of a row's atoms:
--1 where an atom leaves its column, 1 where a vacancy is filled, otherwise 0; the atoms of the row
-keep their order.
+In all kernels ``atoms`` marks the sites that hold an atom, ``fill`` the sites that must hold an atom and
+``clear`` the sites that must be empty. They are bool (n_rows, n_cols), or (n_sites,) for a line. ``limit`` is
+the maximum number of atoms in a batch, and ``slots`` the number of ejection slots on each side. ``source``
+and ``goal`` are as in :mod:`labseq.plugin.plan_kernels`. ``change``, int64 (n_cols,), is an exchange of a
+row's atoms, -1 where an atom leaves its column, 1 where a vacancy is filled, otherwise 0. The atoms of the
+row keep their order.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ HALF_FILLED, FULLEST, EMPTIEST = range(3)
 
 @helper_kernel()
 def place_in_order(n_atoms: int, n_sites: int, order: int) -> int:
-    """Place of a row in an order: the row with the lowest goes first."""
+    """Place of a row in an order. The row with the lowest place goes first."""
     if order == FULLEST:
         return -n_atoms
     if order == EMPTIEST:
@@ -41,7 +40,7 @@ def place_in_order(n_atoms: int, n_sites: int, order: int) -> int:
 
 @helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, bool_[:, ::1], int64, int64[::1], int64[::1], int64)")
 def sort_row(plan: GrowingPlan, atoms: Bools, row: int, change: Ints, count: Ints, limit: int) -> GrowingPlan:
-    """Carry out an exchange in a row; updates ``atoms`` and ``count``."""
+    """Carry out an exchange in a row. Updates ``atoms`` and ``count``."""
     n_cols = len(change)
     source = sites_of(atoms[row])
     for col in range(n_cols):
@@ -51,7 +50,7 @@ def sort_row(plan: GrowingPlan, atoms: Bools, row: int, change: Ints, count: Int
     return add_line(plan, (True, row, n_cols), source, sites_of(atoms[row]), limit, 0)
 
 
-# What a rearrangement costs, the worst first.
+# Costs of a rearrangement, the worst first.
 NOT_CLEARED: Final = 1 << 44
 EJECTED: Final = 1 << 32
 ATOM_MOVED: Final = 1 << 12  # and 1 for each site of distance
@@ -61,8 +60,8 @@ ATOM_MOVED: Final = 1 << 12  # and 1 for each site of distance
 def cost_of_move(source: int, goal: int, clear: Bools, batch: int) -> int:
     """Cost of an atom's move along a line.
 
-    Of the atoms ejected on one side only one leaves per batch, so the n-th costs
-    n - 1 batches more, which distributes them over both sides.
+    Only one of the atoms ejected on one side leaves per batch, so the n-th costs n - 1 batches more, which
+    distributes them over both sides.
     """
     n_sites = len(clear)
     if goal < 0:
@@ -75,17 +74,16 @@ def cost_of_move(source: int, goal: int, clear: Bools, batch: int) -> int:
 
 @helper_kernel()
 def reach(fill: Bools, n_atoms: int, beyond: int, places: Ints) -> None:
-    """Find the first and the last place of each atom with which all fill sites can be taken.
+    """Find the first and the last place of each atom at which all fill sites can be filled.
 
-    The place of atom i is its site minus i, plus ``beyond``: as the order is kept, it
-    never decreases from one atom to the next. On the left of atom i there may be no
-    more fill sites than atoms, and none more on its right than atoms there.
+    The place of atom i is its site minus i, plus ``beyond``. Because the order is kept, it never decreases
+    from one atom to the next. On each side of atom i there may be no more fill sites than atoms.
 
     Args:
         fill: bool (n_sites,), sites that must hold an atom.
         n_atoms: Number of atoms, no fewer than fill sites.
-        beyond: How many sites the line is lengthened by on each side.
-        places: Result, int64 (>= n_atoms, 2): first and last place, last included.
+        beyond: Number of sites by which the line is lengthened on each side.
+        places: Result, int64 (>= n_atoms, 2), first and last place, last included.
     """
     n_sites = len(fill)
     last = n_sites - n_atoms + 2 * beyond
@@ -116,23 +114,23 @@ def compress(
     step: NDArray[np.int16],
     goal: Ints,
 ) -> bool:
-    """Find the cheapest goals of a line's atoms, with every fill site taken.
+    """Find the cheapest goals of a line's atoms that fill every fill site.
 
-    A dynamic programme over atoms and places, see :func:`reach`; the line is
-    lengthened on both sides by as many sites as atoms must be ejected.
+    A dynamic programme over atoms and places, as in :func:`reach`. The line is lengthened on both sides by as
+    many sites as atoms must be ejected.
 
     Args:
-        source: int64 (n_atoms,), where the atoms are, ascending; at least one.
+        source: int64 (n_atoms,), sites of the atoms, ascending, at least one.
         fill: bool (n_sites,), sites that must hold an atom.
         clear: bool (n_sites,), sites that must be empty.
         limit: Maximum number of atoms in a batch.
-        slots: Ejection slots on each side; with 0 nothing is ejected.
-        cost: Work space, int64 (>= n_atoms, > 2 n_sites).
-        step: Work space, int16, likewise.
-        goal: Result, int64 (n_atoms,): where they go, ascending.
+        slots: Ejection slots on each side. With 0 nothing is ejected.
+        cost: Scratch, int64 (>= n_atoms, > 2 n_sites).
+        step: Scratch, int16, the same shape.
+        goal: Result, int64 (n_atoms,), goals of the atoms, ascending.
 
     Returns:
-        Whether all fill sites can be taken.
+        True if all fill sites can be filled.
     """
     n_atoms = len(source)
     n_sites = len(fill)
@@ -162,7 +160,7 @@ def compress(
                 cost[i, place] = best + cost_of_move(source[i], site, clear, limit * ATOM_MOVED)
                 step[i, place] = best_place
             if 0 <= site < n_sites and fill[site]:
-                best = IMPOSSIBLE  # beyond a fill site, no atom may follow one before it
+                best = IMPOSSIBLE  # an atom before a fill site must not be followed by an atom beyond it
         before, last_before = first, last
     best = IMPOSSIBLE
     place = -1

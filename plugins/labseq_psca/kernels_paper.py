@@ -1,6 +1,6 @@
-"""Kernels of the variant as in the paper's text: each row is sorted once, for the columns most in need.
+"""Kernels of the variant as in the paper's text, which sorts each row once for the columns most in need.
 
-The vocabulary is that of :mod:`labseq_psca.kernels_lines`.
+Names are as in :mod:`labseq_psca.kernels_lines`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from labseq_psca.kernels_lines import GRID, Bools, Ints, compress_columns, place
 
 @helper_kernel()
 def order_of_rows(atoms: Bools, order: int) -> Ints:
-    """The rows in the order in which they are sorted; of equal ones the upper first."""
+    """The rows in the order in which they are sorted, with the upper of equal rows first."""
     n_rows, n_cols = atoms.shape
     rows = np.empty(n_rows, np.int64)
     place = np.empty(n_rows, np.int64)
@@ -44,16 +44,16 @@ def order_of_rows(atoms: Bools, order: int) -> Ints:
 def exchange_for_need(row: Bools, need: Ints, count: Ints, change: Ints) -> int:
     """Give atoms of a row to the columns that lack most, from the columns that have most to spare.
 
-    Of equal columns the left one comes first.
+    The left of equal columns comes first.
 
     Args:
         row: bool (n_cols,), the row's atoms.
         need: int64 (n_cols,), fill sites of each column.
-        count: int64 (n_cols,), its atoms.
+        count: int64 (n_cols,), atoms of each column.
         change: Result, int64 (n_cols,), the exchange.
 
     Returns:
-        How many columns are helped.
+        Number of columns that are helped.
     """
     change[:] = 0
     n = 0
@@ -75,7 +75,7 @@ def exchange_for_need(row: Bools, need: Ints, count: Ints, change: Ints) -> int:
 
 @helper_kernel()
 def sort_rows(plan: GrowingPlan, atoms: Bools, fill: Bools, limit: int, order: int) -> GrowingPlan:
-    """Sort each row once, then those again that can still help, until every column has enough.
+    """Sort each row once, then again the rows that can still help, until every column has enough.
 
     Where no row can help a column that lacks atoms, an atom moves within another column first.
     Updates ``atoms``.

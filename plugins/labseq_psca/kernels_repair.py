@@ -1,13 +1,14 @@
-"""Kernels of the repair of few defects: each is filled in the way that costs fewest atoms.
+"""Kernels of the repair of few defects, which fill each in the way that costs the fewest atoms.
 
-Costs are expected losses of atoms: ``costs`` are those of an atom that is moved, of the time of
-a batch, and of one site of way. A defect is filled by a *chain*, a path over sites from the defect
-to a surplus atom, with any turns: each atom on it moves along it to the place of the one before, the
-first to the defect. A chain of one atom is a direct move, straight or as an L. Several defects of
-one line may be filled by one *shift* along it.
+Costs are expected losses of atoms, and ``costs`` holds the cost of an atom that is moved, of the time of a
+batch, and of one site of way. A defect is filled by a *chain*, a path over sites from the defect to a surplus
+atom, with any turns. Each atom on it moves along it to the place of the atom before, and the first to the
+defect. A chain of one atom is a direct move, straight or as an L. Several defects of one line may be filled
+by one *shift* along it.
 
-In all kernels ``atoms`` marks the sites that hold an atom, ``fill`` those that must hold one and ``clear``
-those that must be empty: bool (n_rows, n_cols). ``limit`` is the maximum number of atoms in a batch.
+In all kernels ``atoms`` marks the sites that hold an atom, ``fill`` the sites that must hold an atom and
+``clear`` the sites that must be empty, bool (n_rows, n_cols). ``limit`` is the maximum number of atoms in a
+batch.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ Ints = NDArray[np.int64]
 GRID: Final = const("bool_", 2)
 Costs = tuple[float, float, float]
 Shift = tuple[int, int, int, int, int]
-"""Row and column of a defect, the step to where its atoms come from, and the sites to the last of them."""
+"""Row and column of a defect, the step towards its atoms, and the number of sites to the last of them."""
 
 
 @helper_kernel()
@@ -48,8 +49,8 @@ def shift_to(
     filled too if there are as many surplus atoms.
 
     Returns:
-        The cost, the number of defects that it fills, and the sites from the defect to the last
-        atom that moves. No defects if there is no surplus atom.
+        The cost, the number of filled defects, and the number of sites from the defect to the last atom that
+        moves. Without a surplus atom the number of defects is 0.
     """
     n_rows, n_cols = atoms.shape
     n_sites = n_atoms = n_spare = n_defects = 0
@@ -74,7 +75,7 @@ def shift_to(
 
 @helper_kernel()
 def cheapest_shift(atoms: Bools, fill: Bools, row: int, col: int, costs: Costs) -> tuple[float, int, Shift]:
-    """Find the shift that costs least for each defect that it fills; 0 defects if there is none."""
+    """Find the shift that costs least for each defect that it fills, with 0 defects if there is none."""
     best = (row, col, 0, 0, 0)
     best_cost, best_defects = 0.0, 0
     for side in range(4):
@@ -89,7 +90,7 @@ def cheapest_shift(atoms: Bools, fill: Bools, row: int, col: int, costs: Costs) 
 
 @helper_kernel()
 def dearest_defect(atoms: Bools, fill: Bools, left: Bools, costs: Costs) -> tuple[int, int]:
-    """Find the defect of those ``left`` whose shift costs most, or that has none: row and column, or -1.
+    """Find the defect ``left`` whose shift costs most, or that has none, as row and column or -1.
 
     Sites that hold an atom are removed from ``left``.
     """
@@ -112,12 +113,12 @@ def cheapest_chain(
 ) -> tuple[float, Ints]:
     """Find the cheapest chain to the defect at ``row`` and ``col``, by Dijkstra's algorithm.
 
-    It starts at the defect; a state is a site and the side from which it was reached. An atom that must
-    leave its site anyway costs nothing. A turn costs a batch if there is an atom on the chain before it:
-    an atom alone turns with its tweezer on.
+    It starts at the defect. A state is a site and the side from which it was reached. An atom that must leave
+    its site anyway costs nothing. A turn costs a batch if there is an atom on the chain before it, because
+    only a single atom turns with its tweezer on.
 
     Returns:
-        The cost, and the chain's sites, int64 (n, 2); none if no surplus atom can be reached.
+        The cost, and the chain's sites, int64 (n, 2), none if no surplus atom can be reached.
     """
     n_rows, n_cols = atoms.shape
     n_states = 4 * n_rows * n_cols
@@ -174,7 +175,7 @@ def cheapest_chain(
 def add_run(
     plan: GrowingPlan, atoms: Bools, source: Ints, goal: Ints, row: int, col: int, is_row: bool, limit: int
 ) -> GrowingPlan:
-    """Move atoms of one line from ``source`` to ``goal``, both ascending; updates ``atoms``."""
+    """Move atoms of one line from ``source`` to ``goal``, both ascending. Updates ``atoms``."""
     for i in range(len(source)):
         if is_row:
             atoms[row, source[i]] = False
@@ -191,7 +192,7 @@ def add_run(
 
 @helper_kernel()
 def add_shift(plan: GrowingPlan, atoms: Bools, fill: Bools, shift: Shift, limit: int) -> GrowingPlan:
-    """Add the batches of a shift; updates ``atoms``."""
+    """Add the batches of a shift. Updates ``atoms``."""
     row, col, down, right, n_sites = shift
     source, goal = np.empty(n_sites + 1, np.int64), np.empty(n_sites + 1, np.int64)
     n_atoms = n_goals = 0
@@ -213,7 +214,7 @@ def add_shift(plan: GrowingPlan, atoms: Bools, fill: Bools, shift: Shift, limit:
 
 @helper_kernel()
 def add_bent(plan: GrowingPlan, atoms: Bools, sites: Ints, start: int, stop: int) -> GrowingPlan:
-    """Move the atom on ``sites[start]`` along a chain to ``sites[stop]``, its tweezer on at each turn."""
+    """Move the atom on ``sites[start]`` along a chain to ``sites[stop]``, tweezer on at each turn."""
     corner = start
     for i in range(start - 1, stop - 1, -1):
         turns = i > stop and sites[i - 1, 0] != sites[i + 1, 0] and sites[i - 1, 1] != sites[i + 1, 1]
@@ -228,7 +229,7 @@ def add_bent(plan: GrowingPlan, atoms: Bools, sites: Ints, start: int, stop: int
 
 @helper_kernel()
 def is_straight(sites: Ints, start: int, stop: int) -> bool:
-    """Whether a part of a chain has no turn."""
+    """True if a part of a chain has no turn."""
     way = abs(sites[stop, 0] - sites[start, 0]) + abs(sites[stop, 1] - sites[start, 1])
     in_line = sites[stop, 0] == sites[start, 0] or sites[stop, 1] == sites[start, 1]
     return in_line and way == stop - start
@@ -236,7 +237,7 @@ def is_straight(sites: Ints, start: int, stop: int) -> bool:
 
 @helper_kernel()
 def add_chain(plan: GrowingPlan, atoms: Bools, sites: Ints, row_limit: int, column_limit: int) -> GrowingPlan:
-    """Add the batches of a chain, the atom next to the defect first; updates ``atoms``."""
+    """Add the batches of a chain, with the atom next to the defect first. Updates ``atoms``."""
     n_sites = len(sites)
     at = np.empty(n_sites + 1, np.int64)  # where on the chain the defect and the atoms are
     at[0] = 0
@@ -282,10 +283,10 @@ def add_chain(plan: GrowingPlan, atoms: Bools, sites: Ints, row_limit: int, colu
 def plan_repair(
     occupied: Bools, fill: Bools, clear: Bools, row_limit: int, column_limit: int, costs: Costs
 ) -> tuple[FinishedPlan, Bools]:
-    """Fill defects by chains and shifts, those first that cost most.
+    """Fill defects by chains and shifts, the most expensive first.
 
-    A chain may so pass through the defects that are nearer to its surplus atom, which saves it the atoms
-    that would fill them.
+    Then a chain may pass through the defects that are nearer to its surplus atom, without the atoms that
+    would fill them.
 
     Args:
         occupied: bool (n_rows, n_cols).
@@ -296,7 +297,7 @@ def plan_repair(
         costs: See the module.
 
     Returns:
-        The plan, and the occupancy after it. Defects that no chain reaches are left.
+        The plan, and the occupancy after it. Defects that no chain reaches remain.
     """
     atoms = occupied.copy()
     plan = empty_plan(atoms.size)

@@ -1,4 +1,4 @@
-"""The planner and its settings; the algorithm itself is in the kernels."""
+"""The planner and its settings. The algorithm is in the kernels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from labseq_psca.repair import Repair
 
 Kernel = Callable[..., FinishedPlan]
 RowOrder = Literal["half_filled", "fullest", "emptiest"]
-"""In the order of their numbers in ``kernels_lines``, whose ``place_in_order`` says what each is."""
+"""In the order of their numbers in ``kernels_lines``, whose ``place_in_order`` defines each."""
 
 
 class ToneLimits(Settings):
@@ -39,7 +39,7 @@ class PscaSettings(Settings):
     degree_of_parallelism: int = Field(
         default=7,
         ge=1,
-        description="maximum number of mobile tweezers on at once; the profile's limits hold too",
+        description="maximum number of mobile tweezers on at once; the profile's limits also apply",
     )
     max_tones: ToneLimits = Field(
         default=ToneLimits(),
@@ -47,24 +47,24 @@ class PscaSettings(Settings):
     )
     variant: Literal["fewest", "paper"] = Field(
         default="fewest",
-        description="fewest: a generalised PSCA with fewer batches; paper: the text of Tian et al. taken "
-        "literally, to compare with that paper",
+        description="'fewest' is a generalised PSCA with fewer batches; 'paper' takes the text of Tian et "
+        "al. literally, to compare with that paper",
     )
     row_order: RowOrder = Field(
         default="half_filled",
-        description="which row is sorted first: of equally useful ones with variant fewest, of all with "
+        description="which row is sorted first, of equally useful rows with variant fewest, of all rows with "
         "variant paper",
     )
     repair_below: float = Field(
         default=0.1,
         ge=0,
         le=1,
-        description="fraction of defects up to which repair with few atom moves is considered too; variant "
+        description="fraction of defects up to which repair with few atom moves is also considered; variant "
         "paper never repairs",
     )
 
     def algorithm_text(self) -> str:
-        """Which variant of PSCA it is."""
+        """The variant of PSCA in words."""
         if self.variant == "paper":
             return "PSCA as in the text of Tian et al."
         return "generalised PSCA, with fewer batches than variant: paper"
@@ -73,17 +73,17 @@ class PscaSettings(Settings):
 class PscaPlanner:
     """A generalised PSCA (parallel sort-and-compression) with fewer batches than the text of Tian et al.
 
-    It sorts the rows that help most and then compresses columns, or the reverse if that takes fewer
-    batches. With ``variant: paper`` it does what the text of that paper says.
+    It sorts the rows that help most and then compresses columns, or the reverse if that takes fewer batches.
+    With ``variant: paper`` it follows the text of that paper.
 
     Args:
         settings: The planner's settings.
-        context: Its grid determines which sites are nearest to the target's centre;
-            its motion limits tweezers and tones, and how far out atoms can be ejected.
+        context: Its grid determines which sites are nearest to the target's centre. Its motion limits
+            tweezers and tones, and how far out atoms can be ejected.
 
     Attributes:
-        degree_of_parallelism: Maximum number of atoms that a batch moves; the tone
-            limits of the moving axis may lower it further.
+        degree_of_parallelism: Maximum number of atoms that a batch moves. The tone limits of the moving axis
+            may lower it further.
 
     Example:
         >>> target = TargetPattern(fill=[[True, True, False]], clear=[[False, False, False]])

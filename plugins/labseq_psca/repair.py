@@ -1,4 +1,4 @@
-"""Repair of few defects with few atom moves, after any planner; its algorithm is in ``kernels_repair``."""
+"""Repairs few defects with few atom moves, after any planner. The algorithm is in ``kernels_repair``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class RepairSettings(Settings):
 
     after: dict[str, Any] = Field(
         default={"use": "psca"},
-        description="the planner, with its settings, of arrays with more defects, and of what repair leaves",
+        description="planner and its settings, for arrays with more defects and for the rest after a repair",
     )
     below: float = Field(
         default=0.1,
@@ -45,12 +45,12 @@ class RepairSettings(Settings):
 
 
 class Repair:
-    """Makes a second plan where defects are few, and chooses between the two.
+    """Makes a second plan if defects are few, and chooses between the two.
 
     Args:
         below: Fraction of defects up to which a repair is considered.
         limits: Maximum number of atoms in a batch that moves along a row, and along a column.
-        degree_of_parallelism: Maximum number of mobile tweezers on at once, of either plan.
+        degree_of_parallelism: Maximum number of mobile tweezers on at once, for both plans.
         context: Its grid and its motion, whose losses are the costs.
     """
 
@@ -75,14 +75,14 @@ class Repair:
         target: TargetPattern,
         plan_rest: Callable[[Occupancy], Plan],
     ) -> Plan:
-        """Return the plan after which the target is more probably whole: the given one, or a repair.
+        """Return the given plan or a repair, whichever is more likely to leave the target complete.
 
         Args:
             plan: Another planner's plan.
             atoms: bool (n_rows, n_cols), as detected.
-            fill: The same shape, the fill sites of the target that the atoms suffice for.
+            fill: The same shape, the fill sites of the target for which there are enough atoms.
             target: The pattern to make, of the same shape.
-            plan_rest: Called with the occupancy after the repair: plans what the repair leaves.
+            plan_rest: Called with the occupancy after the repair, to plan for the remaining defects.
         """
         n_defects = int(np.count_nonzero(fill > atoms))
         if not 0 < n_defects <= self._below * target.n_atoms:
@@ -93,22 +93,22 @@ class Repair:
         arrays, after = plan_repair(atoms, fill, target.clear, *self._limits, costs)
         repair = joined(as_plan(arrays), plan_rest(after))
         grid = self._grid
-        if grid.shape != target.shape:  # a planner may be called for another array than the profile's
+        if grid.shape != target.shape:  # the array of a call may not be the profile's
             grid = SiteGrid(*target.shape, grid.spacing_m, lattice=grid.lattice, shear=grid.shear)
         return choose_plan((plan, repair), atoms, target, self._dop, grid, self._motion)
 
     def _costs(self, n_atoms: int) -> tuple[float, float, float]:
-        """Atoms lost by moving one, by the time of a batch, and by that of one site of way."""
+        """Atoms lost by moving an atom, by the time of a batch, and by the time of one site of way."""
         motion = self._motion
         losses = motion.losses
-        per_second = n_atoms / losses.lifetime_s  # of all atoms, which wait while some move
+        per_second = n_atoms / losses.lifetime_s  # of all atoms, because they wait while some move
         batch_s = motion.overhead_per_batch_s + motion.pick_up_s + motion.drop_off_s
         way = self._grid.spacing_m * (per_second / motion.speed_m_s + losses.distance_per_m)
         return -math.log1p(-losses.move), per_second * batch_s, way
 
 
 def joined(first: Plan, then: Plan) -> Plan:
-    """One plan after the other; the first is of line batches alone.
+    """Join two plans. The first has only line batches.
 
     Example:
         >>> plan = Plan.from_batches([([(0, 0)], [(0, 3)])])
@@ -147,15 +147,15 @@ def construct_other(registry: Registry, choice: Mapping[str, Any], context: Cont
 
 
 class RepairPlanner:
-    """Another planner, but few defects are filled with few atom moves where that loses fewer atoms.
+    """Uses another planner, but fills few defects with few atom moves if that loses fewer atoms.
 
     Args:
         settings: The planner's settings.
-        context: Its motion limits tweezers and tones; its losses decide between the plans.
+        context: Its motion limits tweezers and tones. Its losses decide between the plans.
         planner: The other planner.
 
     Attributes:
-        degree_of_parallelism: That of the other planner.
+        degree_of_parallelism: The other planner's.
     """
 
     def __init__(self, settings: RepairSettings, context: Context, planner: Planner) -> None:

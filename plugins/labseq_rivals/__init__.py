@@ -1,4 +1,4 @@
-"""Rivals of PSCA, for comparisons: MTA1, Tetris, and the planners with a single mobile tweezer."""
+"""Rivals of PSCA for comparisons, which are MTA1, Tetris, and planners with a single mobile tweezer."""
 
 from labseq.plugin import Registry, hookimpl
 

@@ -1,4 +1,4 @@
-"""The target of MTA1's geometry: rows to be filled, with rows of the reservoir between them."""
+"""The target of MTA1's geometry, with rows to fill and rows of the reservoir between them."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ class InterleavedSettings(Settings):
 
     rows: int = Field(ge=1, description="rows to be filled")
     cols: int = Field(ge=1, description="columns to be filled")
-    reservoir_rows: int = Field(default=1, ge=0, description="rows left free between two of them")
+    reservoir_rows: int = Field(default=1, ge=0, description="rows left free between two filled rows")
     origin: tuple[Index, Index] | None = Field(
-        default=None, description="[row, column] of the top left site, from 0; centred if left out"
+        default=None, description="[row, column] of the top left site, from 0; centred by default"
     )
     clear: Literal["bounding_box", "none"] = Field(
         default="none",
-        description="bounding_box: the rows between must be empty at the end; none: they are reservoir",
+        description="with 'bounding_box' the rows between must end up empty; with 'none' they are reservoir",
     )
 
     @property
     def block_rows(self) -> int:
-        """Rows from the first to the last one to be filled."""
+        """Number of rows from the first to the last row to fill."""
         return (self.rows - 1) * (self.reservoir_rows + 1) + 1
 
 
 def interleaved(settings: InterleavedSettings, grid: SiteGrid) -> TargetPattern:
-    """Full rows with rows of the reservoir between them, the geometry of Ebadi et al. with one such row.
+    """Full rows with rows of the reservoir between them, one in the geometry of Ebadi et al.
 
     Args:
         settings: Size and place.
         grid: Any grid.
 
     Raises:
-        LimitError: The block is larger than the grid or sticks out of it.
+        LimitError: The block is larger than the grid or extends beyond it.
 
     Example:
         >>> interleaved(InterleavedSettings(rows=2, cols=2), SiteGrid(5, 2)).fill.astype(int).tolist()

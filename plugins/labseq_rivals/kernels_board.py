@@ -1,10 +1,10 @@
-"""Kernels that the planners with a single tweezer share: the board, paths, surplus atoms.
+"""Kernels for boards, paths and surplus atoms that the planners with a single tweezer share.
 
-They work on a grid with a margin of one site on each side, flattened: a site is
-a number, its neighbours are 1 and ``width`` away (``width`` is the number of sites in
-a row, margins included), and the margin stands for the places where atoms are ejected.
-Masks of sites are bool (n_sites,): ``fill`` marks the sites that must hold an atom,
-``clear`` those that must be empty. A path is a list of neighbouring sites, its end first.
+They work on a flattened grid with a margin of one site on each side. A site is a number, and its neighbours
+are 1 and ``width`` away. ``width`` is the number of sites in a row, margins included. The margin represents
+the places where atoms are ejected. Masks of sites are bool (n_sites,). ``fill`` marks the sites that must
+hold an atom, and ``clear`` the sites that must be empty. A path is a list of neighbouring sites, its end
+first.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ Ints = NDArray[np.int64]
 
 GRID: Final = const("bool_", 2)
 
-# What a path costs, the worst first; each counts less than one of the next worse.
-CROSSED: Final = 1 << 40  # an atom in the way, which must move too
-UNWANTED: Final = 1 << 39  # an end that is legal but not wanted; only for end costs
+# Costs of a path, the worst first. Each counts less than one of the next worse.
+CROSSED: Final = 1 << 40  # an atom in the way, which must also move
+UNWANTED: Final = 1 << 39  # an end that is legal but not wanted, only for end costs
 STEP: Final = 1 << 16
-TURN: Final = 1 << 2  # and up to 3 for the choice of an end, all else equal
+TURN: Final = 1 << 2  # and up to 3 for the choice of an end if all else is equal
 
 Board = tuple[Bools, Bools, int]
-"""Where atoms are, the sites that are not a margin, and the width."""
+"""Sites of atoms, sites that are not in the margin, and the width."""
 BOARD: Final = "Tuple((bool_[::1], bool_[::1], int64))"
 
 NO_END: Final = -1
@@ -39,7 +39,7 @@ N_DIRECTIONS: Final = 4
 
 @helper_kernel(f"bool_[::1]({GRID})")
 def with_margin(sites: Bools) -> Bools:
-    """Flatten a mask, with a margin of one site, False there."""
+    """Flatten a mask, with a margin of one site that is False."""
     n_rows, n_cols = sites.shape
     width = n_cols + 2
     flat = np.zeros((n_rows + 2) * width, np.bool_)
@@ -57,14 +57,14 @@ def sites_with_margin(sites: Ints, n_cols: int) -> Ints:
 
 @helper_kernel()
 def board_of(occupied: Bools) -> Board:
-    """Put the atoms of a grid onto a board."""
+    """Put the atoms of a grid on a board."""
     inside = with_margin(np.ones(occupied.shape, np.bool_))
     return with_margin(occupied), inside, occupied.shape[1] + 2
 
 
 @helper_kernel()
 def trace(came_from: Ints, state: int, n_sites: int) -> Ints:
-    """List the sites of the states that led to a state, beginning with its own."""
+    """List the sites of the states that led to a state, starting with its own."""
     n = 0
     at = state
     while at >= 0:
@@ -80,24 +80,23 @@ def trace(came_from: Ints, state: int, n_sites: int) -> Ints:
 
 @helper_kernel(f"int64[::1]({BOARD}, bool_[::1], int64[::1])")
 def cheapest_path(board: Board, starts: Bools, end_cost: Ints) -> Ints:
-    """Find the path from a start to an end that crosses the fewest atoms; then the shortest and straightest.
+    """Find the path from a start to an end that crosses the fewest atoms, then the shortest and straightest.
 
-    Dijkstra's algorithm over sites and directions of arrival. Atoms at the start and at
-    the end are not crossed; only ends may lie on the margin.
+    Dijkstra's algorithm over sites and directions of arrival. Atoms at the start and at the end are not
+    crossed. Only ends may be in the margin.
 
     Args:
         board: The board.
         starts: bool (n_sites,), where the path may start.
-        end_cost: int64 (n_sites,), what to add for a path that ends there, or ``NO_END``;
-            no start is an end.
+        end_cost: int64 (n_sites,), cost to add for a path that ends there, or ``NO_END``. No start is an end.
 
     Returns:
-        int64 (n,); empty if there is none.
+        int64 (n,), empty if there is none.
     """
     atoms, inside, width = board
     n_sites = len(atoms)
     steps = (-width, -1, 1, width)
-    finish = N_DIRECTIONS * n_sites  # states from here on: the path ends at this site
+    finish = N_DIRECTIONS * n_sites  # from here on, the path of a state ends at this site
     cost = np.full(finish + n_sites, np.iinfo(np.int64).max)
     came_from = np.full(finish + n_sites, -1, np.int64)
     queue = [(np.int64(0), np.int64(0)) for _ in range(0)]
@@ -106,7 +105,7 @@ def cheapest_path(board: Board, starts: Bools, end_cost: Ints) -> Ints:
             if starts[site]:
                 state = np.int64(direction * n_sites + site)
                 cost[state] = 0
-                queue.append((np.int64(0), state))  # in ascending order: a heap
+                queue.append((np.int64(0), state))  # ascending, so it is a heap
     while len(queue) > 0:
         so_far, state = heapq.heappop(queue)
         if so_far > cost[state]:
@@ -135,7 +134,7 @@ def cheapest_path(board: Board, starts: Bools, end_cost: Ints) -> Ints:
 
 @helper_kernel()
 def add_segment(plan: GrowingPlan, source: int, goal: int, width: int, goes_on: bool) -> GrowingPlan:
-    """Add a straight move of one atom; ``goes_on`` if the tweezer holds it since the batch before."""
+    """Add a straight move of one atom, with ``goes_on`` if the tweezer has held it since the batch before."""
     row, col, to_row, to_col = source // width - 1, source % width - 1, goal // width - 1, goal % width - 1
     return end_batch(add_move(plan, row, col, to_row, to_col), goes_on)
 
@@ -144,7 +143,7 @@ def add_segment(plan: GrowingPlan, source: int, goal: int, width: int, goes_on: 
 def carry(plan: GrowingPlan, board: Board, path: Ints, start: int, stop: int) -> GrowingPlan:
     """Carry the atom at ``path[start]`` to ``path[stop]``, by a batch for each straight piece.
 
-    ``stop`` is before ``start``, and no atom stands between them.
+    ``stop`` is before ``start``, and no atom is between them.
     """
     atoms, inside, width = board
     corner = start
@@ -172,10 +171,10 @@ def shift(plan: GrowingPlan, board: Board, path: Ints) -> GrowingPlan:
 def clear_surplus(
     plan: GrowingPlan, board: Board, fill_sites: Bools, clear_sites: Bools, may_eject: bool
 ) -> GrowingPlan:
-    """Move the atoms on clear sites to free reservoir sites, or off the grid where there is none.
+    """Move the atoms on clear sites to free reservoir sites, or off the grid if there is none.
 
-    The atom with the cheapest path goes first. Atoms on its path go on to the next
-    place, so that the path costs one move more for each.
+    The atom with the cheapest path goes first. Each atom on its path goes on to the next place, so that the
+    path costs one move more.
     """
     atoms, inside, _ = board
     fill, clear = with_margin(fill_sites), with_margin(clear_sites)

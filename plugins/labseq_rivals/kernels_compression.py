@@ -1,4 +1,4 @@
-"""The kernel of the compression algorithm of Schymik et al.; boards and paths as in ``kernels_board``."""
+"""Kernel of the compression algorithm of Schymik et al., with boards and paths as in ``kernels_board``."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def plan_compression(
         fill_sites: bool (n_rows, n_cols), sites that must hold an atom.
         clear_sites: bool (n_rows, n_cols), sites that must be empty.
         order: int64 (n_fill,), the fill sites, row * n_cols + col, the innermost first.
-        may_eject: Whether atoms can be ejected.
+        may_eject: True if atoms can be ejected.
     """
     n_cols = occupied.shape[1]
     plan, board = empty_plan(occupied.size), board_of(occupied)

@@ -1,4 +1,4 @@
-"""Kernels of the heuristic cluster algorithm of Sheng et al.; boards and paths as in ``kernels_board``."""
+"""Kernels of the heuristic cluster algorithm of Sheng et al., with boards as in ``kernels_board``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from labseq_rivals.kernels_board import (
 
 @helper_kernel()
 def distance_in_the_open(board: Board, starts: Bools) -> Ints:
-    """Measure how far free sites are from the nearest start, along free sites; -1 where no path leads."""
+    """Measure how far free sites are from the nearest start along free sites, or -1 without a path."""
     atoms, inside, width = board
     distance = np.full(len(starts), -1, np.int64)
     queue = np.empty(len(starts), np.int64)
@@ -48,7 +48,7 @@ def distance_in_the_open(board: Board, starts: Bools) -> Ints:
 
 @helper_kernel()
 def farthest(distance: Ints, sites: Bools) -> int:
-    """Find the marked site that is farthest; -1 if none is reached."""
+    """Find the farthest marked site, or -1 if none is reached."""
     found = -1
     for site in range(len(sites)):
         if sites[site] and distance[site] > 0 and (found < 0 or distance[site] > distance[found]):
@@ -58,11 +58,10 @@ def farthest(distance: Ints, sites: Bools) -> int:
 
 @helper_kernel()
 def opening(board: Board, holes: Bools, distance: Ints) -> Ints:
-    """Find the path of an atom between a closed region and the open into the region's depth, its goal first.
+    """Find the path, goal first, of an atom between a closed region and the open into the region's depth.
 
-    Of the closed regions the one with the fewest atoms in the way is taken. The
-    atom next to it goes to the hole that is farthest, so that the rest stays one
-    region, with one atom less in the way.
+    The closed region with the fewest atoms in the way is taken. The atom next to it goes to the farthest
+    hole, so that the rest stays one region, with one atom less in the way.
 
     Args:
         board: The board.
@@ -91,7 +90,7 @@ def plan_clusters(occupied: Bools, fill_sites: Bools, clear_sites: Bools, may_ej
         occupied: bool (n_rows, n_cols), no fewer atoms than fill sites.
         fill_sites: bool (n_rows, n_cols), sites that must hold an atom.
         clear_sites: bool (n_rows, n_cols), sites that must be empty.
-        may_eject: Whether atoms can be ejected.
+        may_eject: True if atoms can be ejected.
     """
     plan, board = empty_plan(occupied.size), board_of(occupied)
     atoms, fill, clear = board[0], with_margin(fill_sites), with_margin(clear_sites)

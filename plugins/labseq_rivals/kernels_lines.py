@@ -1,12 +1,11 @@
-"""Kernels that Tetris and MTA1 share: arrangements of a line, atoms for every column.
+"""Kernels that Tetris and MTA1 share, for arrangements of a line and atoms for every column.
 
-``source`` and ``goal`` are those of :mod:`labseq.plugin.plan_kernels`.
+``source`` and ``goal`` are as in :mod:`labseq.plugin.plan_kernels`.
 
-In all kernels ``atoms`` marks the sites that hold an atom, ``fill`` those that must
-hold one and ``clear`` those that must be empty: bool (n_rows, n_cols), or (n_sites,)
-for a line. ``limit`` is the maximum number of atoms in a batch, and ``slots`` the
-number of ejection slots on each side. ``spare``, int64 (n_cols,), is the number of
-atoms that each column can spare; below 0: that it lacks.
+In all kernels ``atoms`` marks the sites that hold an atom, ``fill`` the sites that must hold an atom and
+``clear`` the sites that must be empty. They are bool (n_rows, n_cols), or (n_sites,) for a line. ``limit`` is
+the maximum number of atoms in a batch, and ``slots`` the number of ejection slots on each side. ``spare``,
+int64 (n_cols,), is the number of atoms that each column can spare, or below 0 the number that it lacks.
 """
 
 from __future__ import annotations
@@ -26,25 +25,24 @@ GRID: Final = const("bool_", 2)
 LINE: Final = const("bool_", 1)
 IMPOSSIBLE: Final = 1 << 62
 
-# What an arrangement of a line costs, the worst first.
+# Costs of an arrangement of a line, the worst first.
 NOT_FILLED: Final = 1 << 52
 NOT_CLEARED: Final = 1 << 42
 EJECTED: Final = 1 << 32
-ATOM_MOVED: Final = 1 << 18  # and 1 for each site of distance: at most 250,000 in 1000 sites
+ATOM_MOVED: Final = 1 << 18  # and 1 for each site of distance, at most 250,000 in 1000 sites
 
 
 @helper_kernel()
 def sum_costs(atoms: Bools, fill: Bools, clear: Bools, cost: Ints, taken: Bools) -> None:
-    """Sum up what the cheapest arrangements of a line's first sites cost, for every balance.
+    """Sum up the costs of the cheapest arrangements of a line's first sites, for every balance.
 
     Args:
         atoms: bool (n_sites,), as ``fill`` and ``clear``.
         fill: See the module.
         clear: See there.
-        cost: int64 (n_sites + 1, 2 n_most + 1), after how many sites, by balance +
-            n_most; its first row is given; updated.
-        taken: Result, bool (n_sites, 2 n_most + 1), whether the last of these sites
-            holds an atom then.
+        cost: int64 (n_sites + 1, 2 n_most + 1), by number of sites and by balance + n_most. Its first row is
+            given. Updated.
+        taken: Result, bool (n_sites, 2 n_most + 1), True if the last of these sites then holds an atom.
     """
     n_most = cost.shape[1] // 2
     for site in range(len(atoms)):
@@ -72,14 +70,13 @@ def sum_costs(atoms: Bools, fill: Bools, clear: Bools, cost: Ints, taken: Bools)
 
 @helper_kernel(f"UniTuple(int64[::1], 2)({LINE}, {LINE}, {LINE}, boolean, boolean)")
 def settle(atoms: Bools, fill: Bools, clear: Bools, low: bool, high: bool) -> tuple[Ints, Ints]:
-    """Find the cheapest arrangement of a line: where its atoms are, and where they go.
+    """Find the cheapest arrangement of a line, as the sources and goals of its atoms.
 
-    A dynamic programme over sites and balances. The balance is the number of atoms
-    up to a site minus the number of goals up to there: that many atoms cross from
-    the site to the next one. It starts below 0 by the atoms that are ejected at the
-    low end, if ``low`` allows that, and ends above 0 by those ejected at the high end.
-    What counts, in this order: fill sites left empty, atoms left on clear sites,
-    ejections, atoms moved, distance; ejections are distributed over both ends.
+    A dynamic programme over sites and balances. The balance is the number of atoms up to a site minus the
+    number of goals up to it, so it is the number of atoms that cross from the site to the next. It starts
+    below 0 by the number of atoms that are ejected at the low end, if ``low`` allows that, and ends above 0
+    by the number ejected at the high end. Fill sites left empty count most, then atoms left on clear sites,
+    ejections, atoms moved and distance. Ejections are distributed over both ends.
     """
     n_sites, source = len(atoms), sites_of(atoms)
     n_wrong = 0
@@ -119,10 +116,10 @@ def settle(atoms: Bools, fill: Bools, clear: Bools, low: bool, high: bool) -> tu
 
 @helper_kernel()
 def nearest_exchange(atoms: Bools, spare: Ints) -> tuple[int, int]:
-    """Find the nearest atom and vacancy of a row of which the one can be spared and the other is lacking.
+    """Find the nearest pair of an atom that can be spared and a lacking vacancy in a row.
 
     Returns:
-        The atom's column and the vacancy's; (-1, ``n_cols``) if there are none.
+        The columns of the atom and the vacancy, or (-1, ``n_cols``) if there are none.
     """
     best_atom, best_vacancy = -1, len(atoms)
     atom = vacancy = -1
@@ -140,7 +137,7 @@ def nearest_exchange(atoms: Bools, spare: Ints) -> tuple[int, int]:
 
 @helper_kernel()
 def row_of_nearest_exchange(atoms: Bools, spare: Ints) -> int:
-    """Find the row with the nearest exchange; -1 if no row has one."""
+    """Find the row with the nearest exchange, or -1 if no row has an exchange."""
     best_row, best = -1, len(spare) + 1
     for row in range(len(atoms)):
         atom, vacancy = nearest_exchange(atoms[row], spare)
@@ -153,9 +150,9 @@ def row_of_nearest_exchange(atoms: Bools, spare: Ints) -> int:
 def supply_columns(plan: GrowingPlan, atoms: Bools, spare: Ints, limit: int) -> GrowingPlan:
     """Give every column as many atoms as it needs, row by row, the row with the nearest exchange first.
 
-    In a row all exchanges are made that there are, the nearest first. Its atoms
-    keep their order: those between go on to the place of the next. There may be no
-    fewer atoms than the columns need. Updates ``atoms`` and ``spare``.
+    All possible exchanges of a row are made, the nearest first. Its atoms keep their order, so atoms in
+    between go on to the place of the next. There must be at least as many atoms as the columns need. Updates
+    ``atoms`` and ``spare``.
     """
     n_cols = len(spare)
     while spare.min() < 0:

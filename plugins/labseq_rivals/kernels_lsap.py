@@ -1,4 +1,4 @@
-"""Kernels that carry out an assignment, as Schymik et al. do; boards and paths as in ``kernels_board``."""
+"""Kernels that carry out an assignment like Schymik et al., with boards and paths as in ``kernels_board``."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def l_shaped(source: int, goal: int, width: int, row_first: bool) -> Ints:
 
 @helper_kernel()
 def n_in_the_way(atoms: Bools, path: Ints) -> int:
-    """Count the atoms on a path, including that on its goal, but not that on its source."""
+    """Count the atoms on a path, including its goal but not its source."""
     n = 0
     for at in range(len(path) - 1):
         if atoms[path[at]]:
@@ -63,16 +63,16 @@ def better_l(atoms: Bools, source: int, goal: int, width: int) -> tuple[int, boo
 
 @helper_kernel()
 def carry_the_free(plan: GrowingPlan, board: Board, goal_of: Ints, waiting: Ints) -> tuple[GrowingPlan, int]:
-    """Move every waiting atom that has a free path to its goal; go through the list once.
+    """Go once through the waiting atoms, and move each atom that has a free path to its goal.
 
     Args:
         plan: The growing plan.
-        board: The board; updated.
-        goal_of: int64 (n_sites,), where the atom on each site goes, -1 for nowhere; updated.
-        waiting: int64 (n_waiting,), sites of the atoms that have not moved; updated.
+        board: The board. Updated.
+        goal_of: int64 (n_sites,), goal of the atom on each site, or -1. Updated.
+        waiting: int64 (n_waiting,), sites of the atoms that have not moved. Updated.
 
     Returns:
-        The growing plan, and how many atoms are still waiting.
+        The growing plan, and the number of atoms still waiting.
     """
     atoms, _, width = board
     n_left = 0
@@ -94,12 +94,11 @@ def carry_the_free(plan: GrowingPlan, board: Board, goal_of: Ints, waiting: Ints
 
 @helper_kernel()
 def exchange(plan: GrowingPlan, board: Board, goal_of: Ints, waiting: Ints) -> GrowingPlan:
-    """Let the last atom in the way go on to the goal, and the one that was to go there take its part.
+    """Let the last atom in the way go on to the goal, and exchange its part with the atom meant to go there.
 
-    Of the waiting atoms the one with the fewest atoms in its way is taken, and it
-    takes over what that last one was to do: go to its goal, fill its place, or nothing. The
-    distance that is left to go does not grow by it, as both parts of the path
-    together are no longer than the whole. Arguments as for :func:`carry_the_free`.
+    The waiting atom with the fewest atoms in its way is taken. It takes over the task of the last atom in its
+    way, which is to go to its goal, fill its place, or nothing. The remaining distance does not grow, because
+    both parts of the path together are no longer than the whole. Arguments as for :func:`carry_the_free`.
     """
     atoms, _, width = board
     least = np.iinfo(np.int64).max
@@ -127,17 +126,16 @@ def plan_assignment(
 ) -> FinishedPlan:
     """Carry out an assignment, then clear what must be empty.
 
-    Atoms with a free goal and a free L go first, and only where none is left do
-    two atoms exchange their parts. Every step takes an atom to its goal for good
-    or settles a goal without a move, so it ends.
+    Atoms with a free goal and a free L go first. Only when none is left, two atoms exchange their parts.
+    Every step takes an atom to its goal for good or settles a goal without a move, so it ends.
 
     Args:
         occupied: bool (n_rows, n_cols).
         fill_sites: bool (n_rows, n_cols), sites that must hold an atom.
         clear_sites: bool (n_rows, n_cols), sites that must be empty.
-        sources: int64 (n_fill,), where the atoms are, row * n_cols + col.
-        goals: int64 (n_fill,), where each goes; every fill site once.
-        may_eject: Whether atoms can be ejected.
+        sources: int64 (n_fill,), sites of the atoms, row * n_cols + col.
+        goals: int64 (n_fill,), goal of each atom, every fill site once.
+        may_eject: True if atoms can be ejected.
     """
     n_cols = occupied.shape[1]
     plan, board = empty_plan(occupied.size), board_of(occupied)

@@ -1,7 +1,7 @@
-"""Kernels of MTA1: presorting between columns, then scans; the vocabulary is that of ``kernels_lines``.
+"""Kernels of MTA1, for presorting between columns and scans, with names as in ``kernels_lines``.
 
-``place`` and ``goal``, int64 (n_cols, n_rows), are the rows of each column's atoms, ascending, and
-where they go; ``n_atoms``, int64 (n_cols,), is the number of atoms of each column.
+``place`` and ``goal``, int64 (n_cols, n_rows), are the rows of each column's atoms, ascending, and their
+goals. ``n_atoms``, int64 (n_cols,), is the number of atoms of each column.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from labseq.plugin.plan_kernels import (
 from labseq_rivals.kernels_lines import GRID, Bools, Ints, settle, supply_columns
 
 Scans = tuple[Ints, int]
-"""How many lines each scan passes, and the number of scans."""
+"""Number of lines that each scan passes, and number of scans."""
 
 
 @helper_kernel()
@@ -41,13 +41,13 @@ def add_scan(scans: Scans, n_lines: int) -> Scans:
 
 @helper_kernel()
 def look_aside(atoms: Bools, col: int, side: int, distance: Ints) -> None:
-    """Measure how far the nearest atom beside each vacancy of a column is.
+    """Measure the distance of each vacancy of a column from the nearest atom in its row.
 
     Args:
         atoms: bool (n_rows, n_cols).
         col: The column.
-        side: Where to look: -1 to the left, 1 to the right.
-        distance: Result, int64 (n_rows,), in columns; 0 where there is no vacancy or no atom.
+        side: Side to look at, -1 for the left, 1 for the right.
+        distance: Result, int64 (n_rows,), in columns, 0 where there is no vacancy or no atom.
     """
     for row in range(len(atoms)):
         distance[row] = 0
@@ -61,7 +61,7 @@ def look_aside(atoms: Bools, col: int, side: int, distance: Ints) -> None:
 
 @helper_kernel()
 def choose_nearest(distance: Ints, chosen: Bools, n_wanted: int) -> int:
-    """Mark the rows with the least distances above 0, ``n_wanted`` at most; return the largest of them."""
+    """Mark up to ``n_wanted`` rows with the least distances above 0, and return the largest of these."""
     farthest = 0
     for _ in range(n_wanted):
         nearest = -1
@@ -95,9 +95,9 @@ def fetch(
         atoms: bool (n_rows, n_cols).
         spare: int64 (n_cols,).
         col: The column.
-        side: Where the atoms come from: -1 from the left, 1 from the right.
-        distance: int64 (n_rows,), see :func:`look_aside`.
-        chosen: bool (n_rows,), see :func:`choose_nearest`.
+        side: Side of the atoms, -1 for the left, 1 for the right.
+        distance: int64 (n_rows,), from :func:`look_aside`.
+        chosen: bool (n_rows,), from :func:`choose_nearest`.
         farthest: The largest distance in the chosen rows.
     """
     for steps in range(farthest, 0, -1):
@@ -122,9 +122,9 @@ def presort(
 ) -> tuple[GrowingPlan, Scans]:
     """Supply the columns that lack atoms, in turns, until none does or nothing helps.
 
-    The side with more atoms to spare in all gives its nearest atoms in the rows
-    where the column has a vacancy, as many as it can spare; their columns may lack
-    atoms afterwards. Updates ``atoms`` and ``spare``.
+    The side with more atoms to spare in all gives its nearest atoms in the rows where the column has a
+    vacancy, as many as it can spare. Their columns may lack atoms afterwards. Updates ``atoms`` and
+    ``spare``.
     """
     n_rows, n_cols = atoms.shape
     distance = np.empty(n_rows, np.int64)
@@ -154,10 +154,10 @@ def presort(
 
 @helper_kernel()
 def end_of_move(place: Ints, goal: Ints, n_atoms: Ints, n_rows: int, col: int, i: int, sense: int) -> int:
-    """Row where a scan drops atom ``i`` of a column: its goal or before the next atom; its own if it stays.
+    """Row where a scan drops atom ``i``, its goal or the row before the next atom, or its own if it stays.
 
-    An atom that is to be ejected waits until none is below it. ``sense`` is 1 for a
-    downward scan, -1 for an upward one.
+    An atom to be ejected waits until none is below it. ``sense`` is 1 for a downward scan, -1 for an upward
+    one.
     """
     ahead = i + sense
     blocked = 0 <= ahead < n_atoms[col]
@@ -171,14 +171,14 @@ def end_of_move(place: Ints, goal: Ints, n_atoms: Ints, n_rows: int, col: int, i
 
 @helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, int64[:, ::1], int64[:, ::1], int64[::1], int64, int64)")
 def scan(plan: GrowingPlan, place: Ints, goal: Ints, n_atoms: Ints, sense: int, limit: int) -> GrowingPlan:
-    """Move a row of tweezers over all rows once; each carries one atom of its column at a time.
+    """Move a row of tweezers over all rows once, each with one atom of its column at a time.
 
     Atoms that are picked up on the same row and dropped on the same row make a batch. ``sense``
     is 1 for a downward scan, -1 for an upward one. Updates ``place`` and ``n_atoms``.
     """
     n_cols, n_rows = place.shape
     n_on = 0
-    n_dropped = np.zeros(n_rows + 1, np.int64)  # by row; an upward scan reaches none below 0
+    n_dropped = np.zeros(n_rows + 1, np.int64)  # by row, and an upward scan reaches none below 0
     following = np.zeros(n_cols, np.int64) if sense > 0 else n_atoms - 1
     picked = np.empty(n_cols, np.int64)
     for step in range(n_rows):
@@ -217,7 +217,7 @@ def scan(plan: GrowingPlan, place: Ints, goal: Ints, n_atoms: Ints, sense: int, 
 def sort_columns(
     plan: GrowingPlan, scans: Scans, atoms: Bools, fill: Bools, clear: Bools, limit: int, may_eject: bool
 ) -> tuple[GrowingPlan, Scans]:
-    """Scan downwards and upwards in turns until every atom is where it goes.
+    """Scan downwards and upwards in turns until every atom is at its goal.
 
     No column may hold fewer atoms than it has fill sites. Atoms are ejected below the last row only.
     """
@@ -245,7 +245,7 @@ def sort_columns(
 
 @helper_kernel()
 def scans_of_exchanges(scans: Scans, plan: GrowingPlan, first_batch: int) -> Scans:
-    """Add a scan for each batch from one on: over the lines between its outermost sites."""
+    """Add a scan for each batch from ``first_batch`` on, over the lines between its outermost sites."""
     moves, offsets, _, n_batches = plan
     for batch in range(first_batch, n_batches):
         low, high = len(moves), 0
@@ -272,7 +272,7 @@ def plan_mta1(
         slots: Ejection slots on each side.
 
     Returns:
-        The plan, and how many lines each scan passes, int64 (n_scans,).
+        The plan, and the number of lines that each scan passes, int64 (n_scans,).
     """
     atoms = occupied.copy()
     spare = column_sums(atoms) - column_sums(fill)

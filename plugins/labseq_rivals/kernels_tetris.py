@@ -1,4 +1,4 @@
-"""Kernels of Tetris: rows piled up from the top, then columns; vocabulary as in ``kernels_lines``."""
+"""Kernels of Tetris, which piles up rows from the top, then columns, with names as in ``kernels_lines``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from labseq_rivals.kernels_lines import GRID, Bools, Ints, settle, supply_column
 
 @helper_kernel()
 def fill_rows(fill: Bools) -> Ints:
-    """List the rows of each column's fill sites, int64 (n_cols, n_rows + 1); ``n_rows`` after the last."""
+    """List the rows of each column's fill sites, int64 (n_cols, n_rows + 1), then ``n_rows``."""
     n_rows, n_cols = fill.shape
     rows = np.full((n_cols, n_rows + 1), n_rows, np.int64)
     for col in range(n_cols):
@@ -34,14 +34,14 @@ def fill_rows(fill: Bools) -> Ints:
 
 @helper_kernel()
 def choose_columns(atoms: Bools, rows: Ints, piled: Ints, chosen: Bools) -> None:
-    """Choose the columns that the atoms of a row go to: those whose next open target row is the uppermost.
+    """Choose the columns for the atoms of a row, whose next open target row is the uppermost.
 
-    Of equals, columns that hold an atom of this row already come first, then the left ones.
+    Among equal columns, columns that already hold an atom of this row come first, then the left columns.
 
     Args:
         atoms: bool (n_cols,), the row.
         rows: int64 (n_cols, n_rows + 1), see :func:`fill_rows`.
-        piled: int64 (n_cols,), how many of each column's target rows have their atom; updated.
+        piled: int64 (n_cols,), number of each column's target rows that have their atom. Updated.
         chosen: Result, bool (n_cols,).
     """
     n_rows = rows.shape[1] - 1
@@ -81,11 +81,11 @@ def pile_up(plan: GrowingPlan, atoms: Bools, fill: Bools, limit: int) -> Growing
 
 @helper_kernel()
 def take_turns_outwards(source: Ints, goal: Ints, n_sites: int, limit: int, slots: int) -> Ints:
-    """Distribute the atoms that move in a line over batches; arguments and result as of ``take_turns``.
+    """Distribute the atoms that move in a line over batches, with the arguments and result of ``take_turns``.
 
-    Those that move up, to higher sites, go one after the other from the upper end, then those that move down
-    from the lower end: each finds its way free, at the latest in the same batch. An ejection waits for a free
-    slot, and whatever is behind it waits as well.
+    Atoms that move up, to higher sites, go one after the other from the upper end, then atoms that move down
+    from the lower end. Each finds its way free, at the latest in the same batch. An ejection waits for a free
+    slot, and all atoms behind it also wait.
     """
     n_atoms = len(source)
     turns = np.zeros(n_atoms, np.int64)

@@ -1,4 +1,4 @@
-"""The planners and their settings; the algorithms are in the kernels."""
+"""The planners and their settings. The algorithms are in the kernels."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sites:
-    """What a planner is asked for.
+    """The task of a planner.
 
     Attributes:
         atoms: bool (n_rows, n_cols), as detected.
-        fill: The same shape, the fill sites that the atoms suffice for.
+        fill: The same shape, the fill sites for which there are enough atoms.
         clear: The same shape, the sites that must be empty.
         wanted: The same shape, the fill sites of the whole target.
     """
@@ -52,14 +52,14 @@ class RivalPlanner(ABC):
 
     Args:
         settings: The planner's settings.
-        context: Its grid determines which sites are nearest to the target's centre;
-            its motion limits tweezers and tones, and the ejection of atoms.
+        context: Its grid determines which sites are nearest to the target's centre. Its motion limits
+            tweezers and tones, and the ejection of atoms.
 
     Attributes:
-        name: What a sequence calls the planner.
+        name: Name of the planner in a sequence.
         kernels: Its module of kernels.
-        degree_of_parallelism: Maximum number of tweezers on at once; the tone limits
-            of an axis may lower it further.
+        degree_of_parallelism: Maximum number of tweezers on at once. The tone limits of an axis may lower it
+            further.
     """
 
     name: ClassVar[str]
@@ -98,7 +98,7 @@ class RivalPlanner(ABC):
         """Run the kernel."""
 
     def sites(self, occupancy: ArrayLike, target: TargetPattern) -> Sites:
-        """The atoms, and what is wanted of them; arguments and errors as for :meth:`plan`."""
+        """The atoms and the wanted sites, with arguments and errors as for :meth:`plan`."""
         try:
             atoms = as_occupancy(occupancy, target.shape)
         except (TypeError, ValueError) as error:
@@ -119,17 +119,16 @@ class LineSettings(Settings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScannedPlan:
-    """A plan that was made of scans.
+    """A plan made from scans.
 
-    In a scan, tweezers in a row (or column) move over the array and each picks up
-    and drops atoms in passing. A plan has no such thing: its tweezers pick up
-    together and drop together. So a scan becomes one batch for every pair of a line
-    where atoms are picked up and a line where they are dropped.
+    In a scan, tweezers in a row (or column) move over the array and each picks up and drops atoms in passing.
+    The tweezers of a plan pick up together and drop together. So a scan becomes one batch for every pair of a
+    line where atoms are picked up and a line where they are dropped.
 
     Attributes:
         plan: The batches, in the order of the scans.
-        lines_passed: int64 (n_scans,), rows (or columns) that each scan passes,
-            the first and the last included.
+        lines_passed: int64 (n_scans,), rows (or columns) that each scan passes, including the first and the
+            last.
     """
 
     plan: Plan
@@ -141,14 +140,14 @@ class ScannedPlan:
         return len(self.lines_passed)
 
     def duration_s(self, grid: SiteGrid, motion: MotionSpec) -> float:
-        """Time that the scans themselves would take, hardware delays left out.
+        """Time that the scans themselves would take, without hardware delays.
 
-        A scan waits on every line that it passes for one ramp, whether or not an
-        atom is picked up or dropped there, and moves by one site in between.
+        A scan waits for one ramp on every line that it passes, with or without an atom to pick up or drop,
+        and moves by one site in between.
 
         Args:
             grid: For the spacing of the sites.
-            motion: For the speed and the ramps, of which the longer one counts.
+            motion: For the speed and the longer of the ramps.
 
         Returns:
             Seconds.
@@ -159,10 +158,10 @@ class ScannedPlan:
 
 
 class Mta1Planner(RivalPlanner):
-    """Pre-sorting between columns, then downward and upward scans, as Ebadi et al. do it.
+    """Pre-sorting between columns, then downward and upward scans, as in Ebadi et al.
 
-    A batch is made of the atoms that a scan picks up on one line and drops on one line.
-    Surplus atoms go to the reservoir of their column, or are ejected below the last row.
+    A batch consists of the atoms that a scan picks up on one line and drops on one line. Surplus atoms go to
+    the reservoir of their column, or are ejected below the last row.
 
     Example:
         >>> target = TargetPattern(fill=[[False, True], [True, False]], clear=[[False, False]] * 2)
@@ -175,7 +174,7 @@ class Mta1Planner(RivalPlanner):
     kernels = "kernels_mta1"
 
     def scan(self, occupancy: ArrayLike, target: TargetPattern) -> ScannedPlan:
-        """Make the same plan, and keep the scans that it is made of; arguments as for :meth:`plan`."""
+        """Make the same plan, and keep its scans, with arguments as for :meth:`plan`."""
         arrays, lines_passed = self._scans(self.sites(occupancy, target))
         return ScannedPlan(as_plan(arrays), lines_passed)
 
@@ -191,7 +190,7 @@ class Mta1Planner(RivalPlanner):
 
 
 class TetrisPlanner(RivalPlanner):
-    """Rows piled up one after the other from the top, then columns compressed, as Wang et al. do it.
+    """Rows piled up one after the other from the top, then columns compressed, as in Wang et al.
 
     A batch moves atoms of one line. Surplus atoms go to the reservoir of their column, or are ejected.
 
@@ -214,10 +213,10 @@ class TetrisPlanner(RivalPlanner):
 
 
 class LsapPlanner(RivalPlanner):
-    """Linear sum assignment: the total travel distance from atoms to fill sites is least.
+    """Linear sum assignment, which minimises the total travel distance from atoms to fill sites.
 
     Attributes:
-        power: Power of the distance that is summed.
+        power: Power of the distance in the sum.
 
     Example:
         >>> target = TargetPattern(fill=[[True, True, False]], clear=[[False, False, False]])
@@ -242,7 +241,7 @@ class LsapPlanner(RivalPlanner):
 
         sources = np.flatnonzero(sites.atoms)
         order = from_the_centre(sites.wanted, self._grid)[: len(sources)]
-        stays = ~sites.clear.reshape(-1)[sources]  # of equal sums, the one that leaves fewest atoms to clear
+        stays = ~sites.clear.reshape(-1)[sources]  # among equal sums, leave the fewest atoms to clear
         cost = travel(order, sources, sites.fill.shape[1]) ** self.power * (len(order) + 1) + stays
         _, assigned = linear_sum_assignment(cost)
         masks = sites.atoms, sites.fill, sites.clear
@@ -250,14 +249,14 @@ class LsapPlanner(RivalPlanner):
 
 
 class LsapSquaredPlanner(LsapPlanner):
-    """The modified linear sum assignment: the sum of the squares of the travel distances is least."""
+    """The modified linear sum assignment, which minimises the sum of the squared travel distances."""
 
     name = "lsap_squared"
     power = 2
 
 
 class CompressionPlanner(RivalPlanner):
-    """The compression algorithm: layer by layer from the centre, each site from the nearest atom outside."""
+    """The compression algorithm, which fills layers from the centre from the nearest atoms outside."""
 
     name = "compression"
     kernels = "kernels_compression"
@@ -271,7 +270,7 @@ class CompressionPlanner(RivalPlanner):
 
 
 class HcaPlanner(RivalPlanner):
-    """The heuristic cluster algorithm: closed regions of defects are opened, open ones are filled."""
+    """The heuristic cluster algorithm, which opens closed regions of defects and fills open regions."""
 
     name = "hca"
     kernels = "kernels_hca"
@@ -288,7 +287,7 @@ def travel(goals: Ints, sources: Ints, n_cols: int) -> Ints:
 
     Args:
         goals: int64 (n_goals,), sites as row * n_cols + col.
-        sources: int64 (n_sources,), likewise.
+        sources: int64 (n_sources,), sites as row * n_cols + col.
         n_cols: Columns of the grid.
 
     Returns:
@@ -304,9 +303,9 @@ def travel(goals: Ints, sources: Ints, n_cols: int) -> Ints:
 
 
 def layers(fill: Bools) -> Ints:
-    """List the fill sites in layers around their common centre, and of each layer the corners first.
+    """List the fill sites in layers around their common centre, the corners of each layer first.
 
-    A layer is what a square around the centre adds to the next smaller one.
+    A layer is what a square around the centre adds to the next smaller square.
 
     Args:
         fill: bool (n_rows, n_cols).
