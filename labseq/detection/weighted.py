@@ -67,9 +67,9 @@ class WeightedSettings(SiteSettings):
     )
     threshold: Thresholds = Field(
         default=0.0,
-        description="log-odds above which there is an atom, used unless a calibration of thresholds is in "
-        "use; a lower value misses fewer atoms and imagines more; one number, rows of numbers (one per "
-        "site), or the path of a .npy file with one per site",
+        description="log-odds above which there is an atom, unless a calibration of thresholds is in use "
+        "(lower misses fewer atoms and imagines more); one number, rows of numbers (one per site), or the "
+        "path of a .npy file with one per site",
     )
     width: PositiveFloat = Field(
         default=2.0,
@@ -114,8 +114,8 @@ class WeightedDetector(ComparingDetector):
 
     Both cases contain the mean light of the neighbours, so a pixel in their light weighs less. A second pass
     subtracts the mean effect of each neighbour found in the first, as in the detection of many senders on one
-    channel (Verdu, Multiuser Detection, 1998, chapter 7). Neighbours are those within the reach of spot and
-    region, on any lattice.
+    channel (Verdu, Multiuser Detection, 1998, chapter 7). Neighbours are all sites within the reach of spot
+    and region, on any lattice.
 
     The confidence is ``tanh(|log-odds - T_ij| / width)``. At T = 0 and a width of 2 it is the probability of
     being right, scaled to 0..1, if half of the sites hold atoms.

@@ -41,7 +41,7 @@ def check_plan(
     motion: MotionSpec | None = None,
     planner: str = "",
 ) -> PlanReport:
-    """Check a plan against all :data:`RULES` and work out what it will do.
+    """Check a plan against all :data:`RULES` and predict what it will do.
 
     The rule ``order`` only compares the ends, for this reason. The tones of a batch start together and have
     the same speed v until each reaches its goal. While two neighbours move the same way, their gap is

@@ -88,14 +88,14 @@ def all_on_program(grid: SiteGrid, motion: MotionSpec, on_s: float) -> ToneProgr
         The tones of both axes, in one batch.
 
     Raises:
-        LimitError: The motion does not allow as many tones at once, or a tone breaks another limit.
+        LimitError: The motion does not allow all tones at once, or a tone breaks another limit.
     """
     for name, n, max_tones in zip(
         AXES, grid.shape, (motion.max_row_tones, motion.max_column_tones), strict=True
     ):
         if n > max_tones:
             limit = f"{max_tones}, `max_{name}_tones` of the profile"
-            raise LimitError(f"the number of {name} tones at once, to measure all of them", n, limit)
+            raise LimitError(f"the number of {name} tones to measure at once", n, limit)
     all_tones = _Batch(np.arange(grid.n_rows), np.arange(grid.n_cols), np.zeros(2))
     return _program(grid, replace(motion, overhead_per_batch_s=0.0), [all_tones], _segments(motion, on_s))
 

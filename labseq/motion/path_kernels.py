@@ -201,9 +201,9 @@ def fill_stands_from(atoms: Bools, lifted: Ints, stamp: int, stands_from: Ints) 
 
 @helper_kernel(f"{FAULT}({MOVES}, {TRACKS}, {KNOTS}, {STAMPS})")
 def check_ends(batch: Moves, tracks: Tracks, off: Ints, stands_from: Ints) -> Fault:
-    """Test that each atom starts on a crossing of tones, and ends where the first of them goes off.
+    """Test that each atom starts on a crossing of tones, and ends where the first of the two goes off.
 
-    The knot at which it does goes into ``stands_from``, for goals on the grid.
+    That knot goes into ``stands_from``, for goals on the grid.
     """
     n_rows, n_cols = stands_from.shape
     for i in range(len(batch)):
@@ -250,8 +250,8 @@ def find_near(
         leg: The leg.
         way: Row and column of its start, and of its end.
         clearance: Least distance.
-        cosine: Of the angle between rows and columns.
-        spared: Row and column of a site that does not count.
+        cosine: Cosine of the angle between rows and columns.
+        spared: Row and column of a site to ignore.
     """
     n_rows, n_cols = stands_from.shape
     # rows, measured along a column, are 1 / sine farther apart than straight across
@@ -274,8 +274,8 @@ def fill_site_distances(down: Floats, right: Floats, cosine: float, squares: Flo
 
     Args:
         down: float64 (n,), row of each place.
-        right: float64 (n,), its column.
-        cosine: Of the angle between rows and columns.
+        right: float64 (n,), column of each place.
+        cosine: Cosine of the angle between rows and columns.
         squares: Result, float64 (n,).
     """
     across = 1.0 - cosine * cosine
@@ -302,7 +302,7 @@ def mark_near_legs(
         down: float64 (n_knots,), its row.
         right: float64 (n_knots,), its column.
         clearance: Least distance.
-        cosine: Of the angle between rows and columns.
+        cosine: Cosine of the angle between rows and columns.
         squares: float64 (n_knots,), see :func:`fill_site_distances`.
         is_near: Result, bool (n_knots - 1,).
     """
@@ -333,7 +333,7 @@ def check_leg(
         lands: True if it goes off after the leg, without an atom.
         stands_from: See :func:`fill_stands_from`.
         clearance: Least distance.
-        cosine: Of the angle between rows and columns.
+        cosine: Cosine of the angle between rows and columns.
         may_land: True if an empty tweezer may end on an atom.
     """
     to_row, to_col = down[leg + 1], right[leg + 1]
@@ -425,11 +425,11 @@ def add_passes(
     """Count passes of atoms at rest, and weigh each pair once, by its least distance.
 
     Args:
-        positions: The paths.
-        off: Likewise.
-        shape: Likewise.
+        positions: See the module.
+        off: See the module.
+        shape: See the module.
         atoms: bool (n_rows, n_cols), the atoms at rest.
-        cosine: Of the angle between rows and columns.
+        cosine: Cosine of the angle between rows and columns.
         distances: In spacings, the distance from which a tweezer does not pass, the distance at which the
             weight is 1, and the additional distance at which it is 1/e.
         of_site: float64 (n_rows, n_cols), to which the weights of each site are added.

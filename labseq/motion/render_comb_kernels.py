@@ -154,7 +154,7 @@ def find_chirp(chirp: float, chirps: Singles, keys: Floats, lanes: Floats) -> in
     """Find exp(pi i chirp j^2) for a strip, which many segments share, or fill it in.
 
     Args:
-        chirp: In cycles per sample squared. Rounded to a grid that makes no difference in a strip.
+        chirp: Chirp, in cycles per sample squared. Rounded to a grid that makes no difference in a strip.
         chirps: float32 (N_CHIRPS, 2, >= STRIP + LANES), the cached chirps. Updated.
         keys: float64 (N_CHIRPS + 1,), each cached chirp, and how many were filled in. Updated.
         lanes: Scratch of :func:`fill_chirp`.
@@ -364,8 +364,8 @@ def fill_table(
         first: Place where j is 0.
         n: Number of samples. There is room for CHUNK more.
         sign: 1 or -1.
-        phase: In cycles.
-        frequency: In cycles per sample.
+        phase: Phase, in cycles.
+        frequency: Frequency, in cycles per sample.
     """
     space = space_of(words)
     sums, tables, lane_re, lane_im = space.sums[at], space.table, space.lanes[0], space.lanes[1]

@@ -118,7 +118,7 @@ def comb_sample_rate(
     raise LimitError(
         "the spacing of row and column tones",
         " and ".join(f"{step:.9g} Hz" for step in steps),
-        f"what one sample rate from {min_hz:.9g} to {max_hz:.9g} Hz holds a whole number of times",
+        f"a divisor of one sample rate from {min_hz:.9g} to {max_hz:.9g} Hz for both",
         "make them equal, or multiples of one another",
     )
 

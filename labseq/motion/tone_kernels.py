@@ -490,7 +490,7 @@ def build_axis(
         batch_offsets: int32 (>= n_batches + 1,).
         linked: bool (>= n_batches,).
         paths: Paths of the plan.
-        cosine: Of the angle between rows and columns.
+        cosine: Cosine of the angle between rows and columns.
         n_batches: Number of batches to build.
         axis: 0 for the row tones, 1 for the column tones.
         n_other_sites: Sites of the other axis.

@@ -1,6 +1,6 @@
-// Plays the motion of a plan: where tones, tweezers and atoms are at a time, drawn on a canvas.
+// Plays the motion of a plan, by drawing tones, tweezers and atoms at a time on a canvas.
 
-// The values of knots [[time, value, ...], ...] at a time: straight between knots, constant outside.
+// The values of knots [[time, value, ...], ...] at a time, straight between knots and constant outside.
 export function valuesAt(knots, t) {
   let low = 0, high = knots.length - 1;
   if (t <= knots[0][0]) return knots[0].slice(1);
@@ -28,7 +28,7 @@ export function stateAt(scene, t) {
   return { batch: ended < 0 ? scene.batches.length : ended, rows, columns, tweezers, atoms };
 }
 
-// A canvas of the width that its element has, with a height in proportion, cleared
+// A cleared canvas as wide as its element, with a height in proportion
 export function prepared(canvas, ratio) {
   const width = Math.max(80, canvas.clientWidth), dpr = Math.min(2, devicePixelRatio || 1);
   const height = Math.round(width * ratio);
@@ -97,7 +97,7 @@ export function describe(scene, state, t) {
   return `${t.toFixed(3)} ms, ${where}${n ? `, ${n} tweezer${n > 1 ? "s" : ""}${empty ? `, ${empty} without an atom` : ""}` : ""}${lost ? `, ${lost} lost` : ""}`;
 }
 
-// A player of a scene, as labseq.pictures.playback writes it: its elements, and functions that draw and play it
+// The elements of a player for a scene of labseq.pictures.playback, and functions that draw and play it
 export function makePlayer(scene, colour) {
   const make = (tag, props) => Object.assign(document.createElement(tag), props);
   const canvas = make("canvas", {}), caption = make("p", { className: "note" }), extent = extentOf(scene);

@@ -55,9 +55,9 @@ def weigh_columns(need: Ints, room: Ints, count: Ints, weight: Ints, leave: Ints
     """Compute the worth of an atom more or less for each column.
 
     Args:
-        need: See the module, also for ``room`` and ``count``.
-        room: See there.
-        count: See there.
+        need: See the module.
+        room: See the module.
+        count: See the module.
         weight: Result, int64 (n_cols,), worth of one atom more, 0 if it lacks none.
         leave: Result, int64 (n_cols,), cost of one atom less, -1 if it can spare none.
 

@@ -44,9 +44,9 @@ def shift_to(
 ) -> tuple[float, int, int]:
     """Find the cheapest shift that fills the defect at ``row`` and ``col`` from one side.
 
-    The atoms between the defect and the nearest surplus atom, seen from the defect in the
-    direction ``down`` and ``right``, move up by one fill site each. Defects on the way are
-    filled too if there are as many surplus atoms.
+    The atoms between the defect and the nearest surplus atom, seen from the defect in the direction ``down``
+    and ``right``, move up by one fill site each. Defects on the way are also filled if there are as many
+    surplus atoms.
 
     Returns:
         The cost, the number of filled defects, and the number of sites from the defect to the last atom that

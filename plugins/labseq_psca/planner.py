@@ -52,7 +52,7 @@ class PscaSettings(Settings):
     )
     row_order: RowOrder = Field(
         default="half_filled",
-        description="which row is sorted first, of equally useful rows with variant fewest, of all rows with "
+        description="row to sort first, among equally useful rows with variant fewest, among all rows with "
         "variant paper",
     )
     repair_below: float = Field(

@@ -39,7 +39,7 @@ def sum_costs(atoms: Bools, fill: Bools, clear: Bools, cost: Ints, taken: Bools)
     Args:
         atoms: bool (n_sites,), as ``fill`` and ``clear``.
         fill: See the module.
-        clear: See there.
+        clear: See the module.
         cost: int64 (n_sites + 1, 2 n_most + 1), by number of sites and by balance + n_most. Its first row is
             given. Updated.
         taken: Result, bool (n_sites, 2 n_most + 1), True if the last of these sites then holds an atom.
