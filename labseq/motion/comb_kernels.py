@@ -43,7 +43,6 @@ def insert(values: Floats, n: int, hz: float) -> tuple[int, int]:
         values: float64 (2, n_most), values and how often each came. Updated. A new value without room is left
             out.
         n: Number of values.
-        hz: The value.
 
     Returns:
         The new number of values, one more than there is room for if it was left out, and its place.

@@ -54,9 +54,7 @@ def expect(
     Args:
         plan_for: The method ``plan`` of a planner.
         loadings: bool (n_rows, n_cols) each, at least one.
-        target: The target.
         degree_of_parallelism: Maximum number of tweezers on at once.
-        grid: The grid of sites.
         motion: How the tweezers move, with the losses.
         window_s: Time from the start of the cycle. Batches that end later are not played.
 

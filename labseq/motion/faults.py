@@ -93,8 +93,6 @@ def raise_plan_error(
     Args:
         fault: Number of the fault, from the kernels of the check.
         fault_place: Its batch, its atom move or -1, and two numbers whose meaning depends on the fault.
-        plan: The plan.
-        grid: The grid of sites.
         max_tweezers: Most tweezers on at once.
         motion: How the tweezers move.
         planner: Name of the planner, or "".

@@ -247,7 +247,6 @@ def find_near(
 
     Args:
         stands_from: See :func:`fill_stands_from`.
-        leg: The leg.
         way: Row and column of its start, and of its end.
         clearance: Least distance.
         cosine: Cosine of the angle between rows and columns.
@@ -299,8 +298,8 @@ def mark_near_legs(
     within 0.71 spacings, and all others are beyond the next lines, 0.87 or more away.
 
     Args:
-        down: float64 (n_knots,), its row.
-        right: float64 (n_knots,), its column.
+        down: float64 (n_knots,), row of the tweezer at each knot.
+        right: float64 (n_knots,), column at each knot.
         clearance: Least distance.
         cosine: Cosine of the angle between rows and columns.
         squares: float64 (n_knots,), see :func:`fill_site_distances`.
@@ -327,9 +326,8 @@ def check_leg(
     """Test that a tweezer comes too near to no atom on a leg.
 
     Args:
-        down: float64 (n_knots,), its row.
-        right: float64 (n_knots,), its column.
-        leg: The leg.
+        down: float64 (n_knots,), row of the tweezer at each knot.
+        right: float64 (n_knots,), column at each knot.
         lands: True if it goes off after the leg, without an atom.
         stands_from: See :func:`fill_stands_from`.
         clearance: Least distance.

@@ -17,8 +17,6 @@ def render_reference(
     """Compute samples in float64, before rounding.
 
     Args:
-        program: The tone program.
-        sample_rate_hz: Sample rate.
         start: First sample.
         stop: The sample after the last. By default the end of the program.
 

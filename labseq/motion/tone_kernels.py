@@ -163,15 +163,12 @@ def add_tones(
 
     Args:
         values: float64 (5, capacity), the axis' tones so far. Updated.
-        n: How many there are.
-        sites: The sites of the axis.
-        tones: The batch's tones.
+        n: Number of tones so far.
         travelled: Sites travelled at the start. Tones with a shorter way have arrived.
         arriving: Sites travelled at the end.
         on_start: 0 if the tones are off at the start, 1 if they are on.
         on_end: The same for the end.
-        duration_s: Duration of the segment.
-        phase: float64 (>= n_tones,), phases in cycles; advanced to the segment's end.
+        phase: float64 (>= n_tones,), phases in cycles. Advanced to the segment's end.
     """
     site_hz, step_hz, site_amplitude = sites
     n_tones = tones.shape[1]
@@ -322,16 +319,13 @@ def add_path_tones(
 
     Args:
         values: As in :func:`add_tones`.
-        n: How many there are.
-        sites: The sites of the axis.
-        of: The batch.
-        knot: Where the segment starts.
-        to_knot: Where it ends.
+        n: Number of tones so far.
+        knot: Knot at the start of the segment.
+        to_knot: Knot at its end.
         start: Amplitude at the start of tones that go off at ``to_knot``, relative to the amplitude of their
             place, which all other tones have.
         end: The same at the end.
-        duration_s: Duration of the segment.
-        phase: float64 (>= n_tones,), phases in cycles; advanced to the segment's end.
+        phase: float64 (>= n_tones,), phases in cycles. Advanced to the segment's end.
     """
     positions, off, shape, axis, _ = of
     for k in range(shape[1 + axis]):
@@ -494,7 +488,6 @@ def build_axis(
         n_batches: Number of batches to build.
         axis: 0 for the row tones, 1 for the column tones.
         n_other_sites: Sites of the other axis.
-        sites: The sites of the axis.
         path_amplitude: float64 (n_sites,), amplitude of each site's tone in batches with paths.
         preassigned: float64 (n_sites,), phase of each site's tone at pick-up, in cycles.
         low_crest: See :func:`first_phases`.

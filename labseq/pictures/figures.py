@@ -33,7 +33,6 @@ def check_place(path: Path, endings: Sequence[str] = ENDINGS, *, drawn: bool = T
     """Check that a picture can be drawn and written, before any other work.
 
     Args:
-        path: The file.
         endings: Allowed endings of its name.
         drawn: True if matplotlib draws it.
 

@@ -211,8 +211,6 @@ def play_back(
     Args:
         plan: The batches that are played.
         occupancy: bool (n_rows, n_cols), before.
-        target: The target.
-        grid: The grid of sites.
         motion: How the tweezers move.
         end_s: End of the last batch, from the start of the cycle.
     """
@@ -335,7 +333,6 @@ def play_back_cycle(shot: Shot, index: int) -> Playback:
     """Compute the places of tweezers and atoms in a cycle of a recorded shot, and which atoms were lost.
 
     Args:
-        shot: The shot.
         index: Index of the cycle, from 0 over all rearrangements of the shot.
 
     Raises:

@@ -72,8 +72,6 @@ def measure_axes(
     """Compute the statistics of the samples of some segments, chunk by chunk, one thread per axis.
 
     Args:
-        program: The tone program.
-        renderer: The renderer.
         segments: Indices of its segments. At least one has tones.
         grid: The grid of sites of the program.
         motion: How the tweezers move.

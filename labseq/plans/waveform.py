@@ -128,7 +128,6 @@ def read_batches(text: str | None, plan: Plan) -> range:
 
     Args:
         text: "2" or "1-3", counted from 0, or None for all.
-        plan: The plan.
 
     Returns:
         Their indices, from 0.
@@ -322,7 +321,6 @@ def save_samples(path: Path, waveform: PlannedWaveform) -> None:
 
     Args:
         path: The file. It replaces an older file.
-        waveform: The waveform.
 
     Raises:
         ConfigError: It cannot be written, for example to a full disk, or :func:`check_samples_file` refuses

@@ -70,7 +70,6 @@ class AutoPlanner:
     found by :func:`labseq.plugin.planning.expect` on loadings that are always the same.
 
     Args:
-        settings: The planner's settings.
         context: Its grid, motion and losses decide.
         registry: Registry with the other planners.
 
@@ -117,7 +116,6 @@ class AutoPlanner:
         """Choose the planner of a target, if that is not done.
 
         Args:
-            target: The target.
             window_s: Time from the start of the first cycle in which its batches must end.
 
         Returns:

@@ -127,7 +127,6 @@ def match_columns(view: View, rows: Ints, k: int, price: float, columns: Ints) -
     highest gain of sources before it.
 
     Args:
-        view: The sites.
         rows: See the module.
         k: Number of rows.
         price: Gain of an atom.

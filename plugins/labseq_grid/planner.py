@@ -134,7 +134,6 @@ def batch_costs(
     Args:
         occupied: bool (n_rows, n_cols).
         has_unwanted: True if there are atoms on sites that must be empty.
-        grid: The grid.
         motion: Its ramps, speed and losses.
         weave: How far lanes swing, from :func:`lane_weave`.
     """
@@ -156,7 +155,6 @@ class GridPlanner:
     """Moves rows x columns of reservoir atoms directly to vacancies, through lanes between the sites.
 
     Args:
-        settings: The planner's settings.
         context: Its grid determines the lanes and which sites are nearest to the target's centre. Its motion
             limits tweezers and tones, and how far out atoms can be ejected.
 

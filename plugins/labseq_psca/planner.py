@@ -77,7 +77,6 @@ class PscaPlanner:
     With ``variant: paper`` it follows the text of that paper.
 
     Args:
-        settings: The planner's settings.
         context: Its grid determines which sites are nearest to the target's centre. Its motion limits
             tweezers and tones, and how far out atoms can be ejected.
 

@@ -150,7 +150,6 @@ class RepairPlanner:
     """Uses another planner, but fills few defects with few atom moves if that loses fewer atoms.
 
     Args:
-        settings: The planner's settings.
         context: Its motion limits tweezers and tones. Its losses decide between the plans.
         planner: The other planner.
 

@@ -86,7 +86,6 @@ def cheapest_path(board: Board, starts: Bools, end_cost: Ints) -> Ints:
     crossed. Only ends may be in the margin.
 
     Args:
-        board: The board.
         starts: bool (n_sites,), where the path may start.
         end_cost: int64 (n_sites,), cost to add for a path that ends there, or ``NO_END``. No start is an end.
 

@@ -64,7 +64,6 @@ def opening(board: Board, holes: Bools, distance: Ints) -> Ints:
     hole, so that the rest stays one region, with one atom less in the way.
 
     Args:
-        board: The board.
         holes: bool (n_sites,), empty fill sites.
         distance: int64 (n_sites,), from the nearest atom to spare along free sites, or -1.
     """

@@ -66,7 +66,6 @@ def carry_the_free(plan: GrowingPlan, board: Board, goal_of: Ints, waiting: Ints
     """Go once through the waiting atoms, and move each atom that has a free path to its goal.
 
     Args:
-        plan: The growing plan.
         board: The board. Updated.
         goal_of: int64 (n_sites,), goal of the atom on each site, or -1. Updated.
         waiting: int64 (n_waiting,), sites of the atoms that have not moved. Updated.

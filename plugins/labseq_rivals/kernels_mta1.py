@@ -45,7 +45,6 @@ def look_aside(atoms: Bools, col: int, side: int, distance: Ints) -> None:
 
     Args:
         atoms: bool (n_rows, n_cols).
-        col: The column.
         side: Side to look at, -1 for the left, 1 for the right.
         distance: Result, int64 (n_rows,), in columns, 0 where there is no vacancy or no atom.
     """
@@ -91,10 +90,8 @@ def fetch(
     Updates ``atoms``, ``spare`` and ``distance``, which is 0 afterwards where an atom was moved.
 
     Args:
-        plan: The growing plan.
         atoms: bool (n_rows, n_cols).
         spare: int64 (n_cols,).
-        col: The column.
         side: Side of the atoms, -1 for the left, 1 for the right.
         distance: int64 (n_rows,), from :func:`look_aside`.
         chosen: bool (n_rows,), from :func:`choose_nearest`.

@@ -51,7 +51,6 @@ class RivalPlanner(ABC):
     """Base of all planners here.
 
     Args:
-        settings: The planner's settings.
         context: Its grid determines which sites are nearest to the target's centre. Its motion limits
             tweezers and tones, and the ejection of atoms.
 
