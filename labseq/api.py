@@ -1,4 +1,4 @@
-"""Planners, targets and tone programs by name, without a sequence: for notebooks and scripts."""
+"""Makes planners, targets and tone programs by name, without a sequence, for notebooks and scripts."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def make_planner(
 
     Args:
         name: For example "psca".
-        grid: The grid of sites, or its (n_rows, n_cols); the paper's by default.
-        motion: How the mobile tweezers move; the paper's by default.
+        grid: The grid of sites, or its (n_rows, n_cols). Default is the paper's grid.
+        motion: How the mobile tweezers move. Default is the paper's motion.
         plugin_folders: Folders with further plugins.
         **settings: The planner's own settings.
 
     Raises:
         UnknownPluginError: No installed plugin offers it.
-        PluginLoadError: Its plugin failed to load, or is at fault.
+        PluginLoadError: Its plugin failed to load, or has a defect.
         ConfigError: A setting is wrong.
 
     Example:
@@ -76,7 +76,7 @@ def make_target(
 
     Raises:
         UnknownPluginError: No installed plugin offers it.
-        PluginLoadError: Its plugin failed to load, or is at fault.
+        PluginLoadError: Its plugin failed to load, or has a defect.
         ConfigError: A setting is wrong.
         LimitError: The target does not fit on the grid.
 
@@ -97,17 +97,17 @@ def tone_program(
     *,
     profile: str | Path | None = None,
 ) -> ToneProgram:
-    """Turn a checked plan into a tone program; see :func:`labseq.motion.tone_program`.
+    """Turn a checked plan into a tone program. See :func:`labseq.motion.tone_program`.
 
     Args:
         plan: A plan that :func:`check_plan` accepted.
-        grid: The grid of sites; by default the profile's, or else the paper's.
-        motion: How the tweezers move; by default as in the profile, or else in the paper.
-        n_batches: How many batches to play, from the first; by default all.
+        grid: The grid of sites. Default is the profile's grid, without a profile the paper's.
+        motion: How the tweezers move. Default is the profile's motion, without a profile the paper's.
+        n_batches: Number of batches to play, from the first. Default is all.
         profile: Name or path of a hardware profile.
 
     Returns:
-        The tones of both axes; ``program.tones_at(t_s)`` says what is intended at a time.
+        The tones of both axes. ``program.tones_at(t_s)`` gives the intended tones at a time.
 
     Raises:
         ConfigError: The profile does not exist, or has an error.

@@ -32,7 +32,7 @@ _UNREADABLE: Final = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What numpy, zipfile and h5py raise for files that are damaged or of another kind."""
+"""Errors that numpy, zipfile and h5py raise for files that are damaged or of another kind."""
 
 
 def split_name(path: str | Path) -> tuple[Path, str]:
@@ -53,17 +53,17 @@ def split_name(path: str | Path) -> tuple[Path, str]:
 
 @contextmanager
 def opened_array(path: Path, name: str = "") -> Generator[Any]:
-    """Open an array; what is read of it is what is indexed, except of a ``.npz`` file, which is read whole.
+    """Open an array of which only indexed parts are read, except from a ``.npz`` file, which is read whole.
 
     Args:
         path: A file with one of the endings :data:`ARRAY_FILES`.
-        name: Which array of a ``.npz`` or HDF5 file; "" for the only one.
+        name: Name of the array in a ``.npz`` or HDF5 file, or "" for the only one.
 
     Yields:
-        The array or dataset, with ``shape`` and ``dtype``, of numbers.
+        The array or dataset of numbers, with ``shape`` and ``dtype``.
 
     Raises:
-        ConfigError: The file or the array cannot be read, also by the body, or the name is missing or wrong.
+        ConfigError: The file or array cannot be read, also in the body, or the name is missing or wrong.
     """
     try:
         with _OPENERS[path.suffix.lower()](path, name) as array:
@@ -115,15 +115,15 @@ _OPENERS: Final = {".npy": _npy, ".npz": _npz, ".h5": _hdf5, ".hdf5": _hdf5}
 
 
 def _array_name(path: Path, name: str, shapes: Mapping[str, str]) -> str:
-    """The name of the array that is meant.
+    """The full name of the array that the user asked for.
 
     Args:
         path: The file.
-        name: As given; "" for the only one.
-        shapes: Name -> shape, as the message has it, of each array in the file.
+        name: As given, or "" for the only one.
+        shapes: Name -> shape, as the message shows it, of each array in the file.
 
     Raises:
-        ConfigError: There is no such array, or several, of which one has to be named.
+        ConfigError: There is no such array, or there are several and none was named.
     """
     if name in shapes or (not name and len(shapes) == 1):
         return name or next(iter(shapes))

@@ -1,8 +1,8 @@
 """The error tree of labseq.
 
-Every error that labseq raises on purpose is a :class:`LabseqError`. It carries
-its values as attributes, and its message says what was found, what was expected and
-what to do. ``exit_code`` is the exit code of the command line.
+Every error that labseq raises on purpose is a :class:`LabseqError`. Its attributes hold the values, its
+message says what is wrong, what was expected and what to do. ``exit_code`` is the exit code of the command
+line.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Loc: TypeAlias = tuple[str | int, ...]
 
 
 class LabseqError(Exception):
-    """Base of all errors that labseq raises on purpose; all of them can be pickled."""
+    """Base of all errors that labseq raises on purpose. All of them can be pickled."""
 
     exit_code: ClassVar[int] = 1
 
@@ -27,7 +27,7 @@ class LabseqError(Exception):
 
 
 def _restored(kind: type[LabseqError], args: tuple[Any, ...], values: dict[str, Any]) -> LabseqError:
-    """An error that was pickled; the constructors of most take other arguments than their text."""
+    """Restore a pickled error without its constructor, which rarely takes the text as its argument."""
     error = kind.__new__(kind)
     error.args = args
     vars(error).update(values)
@@ -39,13 +39,13 @@ class Problem:
     """One problem in a configuration file.
 
     Attributes:
-        what: The error, naming the offending key or value.
+        what: Description of the problem, with the key or value that causes it.
         source: File name, or the option it came from (``--set a.b=c``).
-        line: Line in ``source``, counted from 1; 0 if that has none, as an option.
-        column: Column in the line, or in the option as ``source`` has it, counted from 1; 0 if there is none.
+        line: Line in ``source``, counted from 1, or 0 for an option.
+        column: Column in the line or in the option, counted from 1. 0 if there is none.
         expected: The expected value, or "".
         hint: A remedy, for example "did you mean 'rows'?", or "".
-        notes: Other places to look at: the value that this one conflicts with, or a default.
+        notes: Other places to look at, such as the value that this one conflicts with, or a default.
     """
 
     what: str
@@ -72,7 +72,7 @@ class ConfigError(LabseqError, ValueError):
     """A sequence, a profile or an option has an error.
 
     Attributes:
-        problems: All problems that were found, each once, in file order.
+        problems: All problems, each once, in file order.
     """
 
     exit_code: ClassVar[int] = 2
@@ -121,7 +121,7 @@ class ProblemCollector:
         self.problems += error.problems
 
     def stop(self, error: ConfigError) -> ConfigError:
-        """Combine an error after which nothing else can be checked with all collected problems."""
+        """Combine a final error, after which nothing else can be checked, with all collected problems."""
         self.add(error)
         return self._joined()
 
@@ -142,7 +142,7 @@ class ProblemCollector:
 
 @contextmanager
 def collecting(problems: ProblemCollector | None = None) -> Generator[ProblemCollector]:
-    """Collect the problems of a block for the caller; without a collector, raise them all when it ends."""
+    """Collect a block's problems in the caller's collector, or raise them all at its end without one."""
     if problems is not None:
         yield problems
         return
@@ -160,7 +160,7 @@ class PluginLoadError(LabseqError):
     Attributes:
         plugin: Name of the plugin.
         reason: Why it failed to load.
-        source: Its file, or the distribution that it came with; "" if the reason names it, or it has none.
+        source: Its file or its distribution. "" if the reason names it, or if it has none.
     """
 
     exit_code: ClassVar[int] = 2
@@ -227,11 +227,11 @@ class DeviceTimeoutError(DeviceError, TimeoutError):
 
 
 class DeviceHungError(DeviceTimeoutError):
-    """A call into a device, its driver or a step did not return; its thread may still run."""
+    """A call into a device, its driver or a step did not return. Its thread may still run."""
 
 
 class InterlockError(DeviceError):
-    """A value that a device watches exceeds its limit or cannot be read; no policy continues the run."""
+    """A value that a device watches exceeds its limit or cannot be read. No policy lets the run continue."""
 
 
 class LimitError(LabseqError, ValueError):
@@ -241,7 +241,7 @@ class LimitError(LabseqError, ValueError):
         what: The quantity, for example "row tones in batch 3".
         value: The value.
         limit: The limit that it exceeds.
-        setting: Location of the setting of the profile that it follows from; () if unknown.
+        setting: Location of the profile's setting that sets the limit. () if unknown.
     """
 
     exit_code: ClassVar[int] = 2
@@ -274,10 +274,10 @@ class InvalidPlanError(PlanError):
 
     Attributes:
         rule: The rule that was broken, one of :data:`labseq.motion.RULES`.
-        batch: Index of the batch, from 0; -1 if the plan as a whole is wrong.
+        batch: Index of the batch, from 0. -1 if the plan as a whole is wrong.
         move: Index of the atom move within the batch, from 0, or -1.
-        detail: The error, with the sites.
-        site: Row and column of the site that the rule is broken at; None if there is no particular one.
+        detail: Description of the problem, with the sites.
+        site: Row and column of the site where the rule is broken. None if it is no single site.
     """
 
     def __init__(
@@ -306,7 +306,7 @@ class RecordingError(LabseqError):
 
     Attributes:
         path: The file or folder.
-        what: What is wrong with it.
+        what: The problem.
         advice: What to do, or "".
     """
 
@@ -325,7 +325,7 @@ class RecordingError(LabseqError):
 
 
 class TransientError(LabseqError):
-    """A rare failure; repeating the shot may succeed.
+    """A rare failure. Repeating the shot may succeed.
 
     Attributes:
         device: Role or device name, or "".
@@ -341,7 +341,7 @@ class TransientError(LabseqError):
 
 
 class ShotAbortedError(TransientError):
-    """The external control system aborted the shot; it is repeated at the next `go`, however often."""
+    """The external control system aborted the shot. It is repeated at the next `go`, without a limit."""
 
 
 class StepTimeoutError(TransientError):
@@ -387,7 +387,7 @@ class AlarmError(LabseqError):
 
     Attributes:
         alarm: Its name in the profile, for example "atoms".
-        text: What it says.
+        text: Its message.
         n_shots: Number of shots in a row.
     """
 
@@ -403,7 +403,7 @@ class AlarmError(LabseqError):
 
 
 class StopRequested(LabseqError):  # noqa: N818 - a request, not an error
-    """The user asked the run to stop; every wait raises it within 50 ms, or it is raised between two shots.
+    """The user asked the run to stop. Raised by every wait within 50 ms, or between shots.
 
     Attributes:
         signal_number: 1 for a terminal that was closed (SIGHUP), 2 for Ctrl-C (SIGINT), 15 for SIGTERM and

@@ -1,11 +1,11 @@
 """Runs every call into a plugin with a time limit, in a thread that can be abandoned.
 
-A plugin that hangs costs one thread, one that fails is named in the error, and one that calls ``sys.exit``
-ends nothing. While a call is out, the main thread looks for Ctrl-C and for stop requests.
+A plugin that hangs costs one thread. If a plugin fails, the error names it. A plugin that calls ``sys.exit``
+ends nothing. While a call runs, the main thread looks for Ctrl-C and for stop requests.
 
-A device has a thread of its own. The steps of a shot share one, and the planner, the detector and
-devices that allow it are called in that one too: waking another thread takes 0.1 ms of the time between a
-frame and the moves.
+Each device has its own thread. The steps of a shot share a thread. The planner, the detector and devices that
+allow it are called in the same thread, because waking another takes 0.1 ms of the time between a frame and
+the moves.
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 POLL_S: Final = 0.05
-"""How often a waiting thread looks for a stop request; on Windows, Ctrl-C does not wake a waiting thread."""
+"""How often a waiting thread looks for a stop request. Ctrl-C does not wake a waiting thread on Windows."""
 GRACE_S: Final = 1.0
 """How long a call may take to return after a stop request."""
 SHOT_GRACE_S: Final = 2.0
-"""The same for the steps of a shot, whose own call into a device has its grace first."""
+"""The same for the steps of a shot. It is longer, because a step's own call into a device has its grace
+first."""
 DRIVER_MARGIN_S: Final = 2.0
 """A call counts as hung this long after the timeout that the driver itself was given."""
 
@@ -40,7 +41,7 @@ DRIVER_MARGIN_S: Final = 2.0
 class Pulse:
     """Progress of one thread, for the heartbeat that another thread sends.
 
-    The thread beats wherever it waits, whatever it waits for; what it does between two waits is short.
+    The thread beats whenever it waits. The work between two waits is short.
     """
 
     def __init__(self) -> None:
@@ -54,15 +55,15 @@ class Pulse:
         self._n += 1
 
     def beat(self) -> None:
-        """Note progress; calls from other threads do not count."""
+        """Note progress. Calls from other threads do not count."""
         if threading.get_ident() == self._thread:
             self._n += 1
 
     def silent_s(self, passed_s: float) -> float:
-        """For how long there was no progress.
+        """Time without progress, in seconds.
 
         Args:
-            passed_s: Time since the last question, as far as it counts.
+            passed_s: Time since the last call that counts towards it, in seconds.
         """
         self._silent_s = self._silent_s + passed_s if self._n == self._n_before else 0.0
         self._n_before = self._n
@@ -70,10 +71,10 @@ class Pulse:
 
 
 class StopFlag:
-    """The request to stop a run: set by a signal, checked by everything that waits.
+    """The request to stop a run, set by a signal and checked wherever labseq waits.
 
-    While it is held (the devices are being made safe) waits do not raise, so that a driver can ramp down
-    undisturbed.
+    While it is held, because the devices are being made safe, waits do not raise, so that a driver can ramp
+    down undisturbed.
 
     Attributes:
         signal_number: The signal that the run reports.
@@ -88,7 +89,7 @@ class StopFlag:
         self.pulse = Pulse()
 
     def request(self, signal_number: int = 2) -> None:
-        """Ask the run to stop; safe to call from a signal handler."""
+        """Ask the run to stop. Safe to call from a signal handler."""
         if not self._event.is_set():
             self.signal_number = signal_number
         self._n_requests += 1
@@ -110,7 +111,7 @@ class StopFlag:
 
     @property
     def is_urgent(self) -> bool:
-        """Whether it was asked twice: from then on, only work on devices is waited for."""
+        """Whether it was asked twice. From then on, only calls into devices are waited for."""
         return self._n_requests > 1
 
     def check(self) -> None:
@@ -120,7 +121,7 @@ class StopFlag:
             raise StopRequested(self.signal_number)
 
     def wait(self, duration_s: float) -> None:
-        """Wait in real time; raise ``StopRequested`` as soon as the run is asked to stop."""
+        """Wait in real time. Raises ``StopRequested`` as soon as the run is asked to stop."""
         deadline_s = time.monotonic() + duration_s
         self.check()
         while (left_s := deadline_s - time.monotonic()) > 0:
@@ -148,8 +149,8 @@ _EXIT_SIGNALS: Final[dict[Any, int]] = {  # signal -> the signal that the run re
 def stop_on_signals(stop: StopFlag) -> Generator[None]:
     """Let Ctrl-C, SIGTERM and SIGHUP set a flag while the block runs, instead of raising an exception.
 
-    A lost terminal that is ignored (``nohup``) stays ignored. Python lets only
-    the main thread handle signals; in any other this does nothing.
+    If SIGHUP was ignored before (``nohup``), it stays ignored. Outside the main thread this does nothing,
+    because Python handles signals only there.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -176,9 +177,9 @@ class Limit:
 
     Attributes:
         owner: Device or plugin that is called, or "step".
-        name: The function or the step, for the message, with a space at its end; "" if it has no name.
+        name: The function or the step, for the message, with a space at its end. "" if it has no name.
         timeout_s: The limit.
-        deadline_s: When it is reached, on the monotonic clock.
+        deadline_s: Time at which the limit is reached, on the monotonic clock.
     """
 
     owner: str
@@ -192,10 +193,10 @@ class GuardedCall:
 
     Attributes:
         done: Set when it has returned.
-        result: What it returned.
-        error: What it raised, or None.
+        result: Its return value.
+        error: The exception it raised, or None.
         has_steps: True for the call that runs a whole shot.
-        is_abandoned: True once nothing waits for it any longer; from then on it must make no calls.
+        is_abandoned: True once nothing waits for it any longer. From then on it must make no calls.
     """
 
     def __init__(self, work: partial[Any], *, has_steps: bool = False) -> None:
@@ -223,12 +224,12 @@ class GuardedCall:
         self._limits.append(limit)
 
     def leave(self) -> None:
-        """End what was begun last."""
+        """End the part that was begun last."""
         with self._lock:
             self._limits.pop()
 
     def abandon_if_late(self) -> Limit | None:
-        """Abandon the call if a limit is reached, the innermost first; returns that limit."""
+        """Abandon the call if a limit is reached. Returns that limit, the innermost if there are several."""
         now_s = time.monotonic()
         with self._lock:  # with `leave`: a part that has just ended in time must not be the late one
             late = next((limit for limit in reversed(self._limits) if now_s >= limit.deadline_s), None)
@@ -273,12 +274,12 @@ class _Worker:
 class Guard:
     """Runs the calls into devices and plugins.
 
-    Those into a device are made in one thread: vendor libraries want all calls from the same. A
-    call that does not return in time is abandoned. Its thread cannot be ended and lives on until the
-    process ends; further calls of the same owner get a new thread.
+    All calls into a device are made in one thread, as vendor libraries require. A call that does not return
+    in time is abandoned. Its thread cannot be ended and lives until the process ends. Further calls of the
+    same owner get a new thread.
 
     Args:
-        stop: The request to stop; without one, calls are never stopped.
+        stop: The request to stop. Without it, calls are never stopped.
 
     Attributes:
         direct: Owners whose calls a shot makes in the thread of its steps. If one of these hangs, the shot is
@@ -294,10 +295,10 @@ class Guard:
     def call(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """Call a function of a device or plugin; see ``labseq.plugin.Shot.call``.
+        """Call a function of a device or plugin. See ``labseq.plugin.Shot.call``.
 
-        After a stop request, or in a shot that was abandoned, nothing is called any more, not even while the
-        request is held: a step that wakes up late must not switch anything on after the safe state.
+        After a stop request, or in an abandoned shot, nothing is called any more, not even while the request
+        is held, because a step that wakes up late must not switch anything on after the safe state.
         """
         self.check()
         return self._call(owner, timeout_s, GRACE_S, partial(function, *args, **kwargs))
@@ -305,7 +306,7 @@ class Guard:
     def call_despite_stop(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """The same, even if the run is asked to stop; for opening, safe states and closing."""
+        """Call a function even if the run is asked to stop, to open, make safe or close a device."""
         return self._call(owner, timeout_s, math.inf, partial(function, *args, **kwargs))
 
     def begin(
@@ -314,7 +315,7 @@ class Guard:
         """Begin a call, even if the run is asked to stop.
 
         Args:
-            is_patient: False for a call that a second request to stop abandons, such as one of the disk.
+            is_patient: False if a second stop request abandons the call, as for writing to the disk.
 
         Returns:
             An event that is set when the call has ended, and a function that waits for this and returns
@@ -343,7 +344,7 @@ class Guard:
         return call is not None and call.is_abandoned
 
     def run_shot(self, work: partial[None]) -> None:
-        """Run the steps of a shot; it is abandoned if one of them hangs, or soon after a stop request.
+        """Run the steps of a shot. It is abandoned if a step hangs, or soon after a stop request.
 
         Raises:
             LabseqError: As the shot raised it.
@@ -356,10 +357,10 @@ class Guard:
 
     @contextmanager
     def step(self, name: str, timeout_s: float, owner: str = "step") -> Generator[None]:
-        """A step, within :meth:`run_shot`, or another part of a call, with a time limit of its own.
+        """Give the block, a step in :meth:`run_shot` or another part of a call, a time limit of its own.
 
         Args:
-            name: Names it in messages, with a space at its end.
+            name: Its name in messages, with a space at its end.
             timeout_s: Its time limit.
             owner: The device or plugin that a message names, or "step".
 
@@ -395,7 +396,7 @@ class Guard:
             has_steps: True for the call that runs a whole shot.
 
         Returns:
-            The call with its result or error; None if it has not returned in time and is abandoned.
+            The call with its result or error, or None if it has not returned in time and is abandoned.
 
         Raises:
             StopRequested: The run was asked to stop, and the call did not return in its grace time.
@@ -407,11 +408,11 @@ class Guard:
         return self._wait(call, time.monotonic() + timeout_s, grace_s)
 
     def _submit(self, owner: str, call: GuardedCall) -> bool:
-        """Hand a call to the owner's thread; False if it was carried out here instead."""
+        """Hand a call to the owner's thread. False if it was carried out here instead."""
         try:
             with self._lock:
                 self._worker(owner).submit(call)
-        except (RuntimeError, MemoryError):  # no thread can be started: better no limit than no call
+        except (RuntimeError, MemoryError):  # no thread can be started; a call without limit beats none
             call.run()
             return False
         return True
@@ -419,7 +420,7 @@ class Guard:
     def _wait(
         self, call: GuardedCall, deadline_s: float, grace_s: float, *, is_patient: bool = True
     ) -> GuardedCall | None:
-        """Wait for the end of a call; see :meth:`run`."""
+        """Wait for the end of a call. See :meth:`run`."""
         try:
             self._stop.pulse.beat()
             while not call.done.wait(min(POLL_S, max(0.0, deadline_s - time.monotonic()))):
@@ -442,7 +443,7 @@ class Guard:
         return call
 
     def end(self) -> None:
-        """End the idle threads, and each other one as soon as its call returns."""
+        """End the idle threads now, and the others as soon as their calls return."""
         with self._lock:
             for worker in self._workers.values():
                 worker.end()
@@ -453,12 +454,12 @@ class Guard:
         if worker is not None and not worker.busy:
             return worker
         if worker is not None:
-            worker.end()  # its call hangs, or is another thread's: no further ones follow it
+            worker.end()  # its call hangs, or belongs to another thread, so it gets no further calls
         worker = self._workers[owner] = _Worker(owner)
         return worker
 
     def _call(self, owner: str, timeout_s: float, grace_s: float, work: partial[T]) -> T:
-        """Run a call; an error that is not one of labseq's own is raised again with owner and function."""
+        """Run a call. Errors other than labseq's own are raised again with the owner and the function."""
         limit = _limit(owner, timeout_s, work)
         shot = current_call()
         if owner in self.direct and grace_s < math.inf and shot is not None and shot.has_steps:

@@ -1,8 +1,7 @@
 """The four hooks of labseq plugins.
 
-A plugin is a module (or an installed package with an entry point of group
-``labseq``) that implements any of these with ``@labseq.plugin.hookimpl`` and states the
-``LABSEQ_API`` it was written for.
+A plugin is a module (or an installed package with an entry point of group ``labseq``) that implements any of
+these with ``@labseq.plugin.hookimpl`` and defines ``LABSEQ_API``, the version it was written for.
 """
 
 from __future__ import annotations
@@ -20,21 +19,21 @@ hookimpl: Final = pluggy.HookimplMarker("labseq")
 
 
 LABSEQ_API: Final = 1
-"""Version of the hooks and roles; a plugin written for another one is not loaded."""
+"""Version of the hooks and roles. A plugin written for another version is not loaded."""
 
 
 @hookspec
 def labseq_register(registry: Registry) -> None:
-    """Offer factories: ``registry.planner("mine", MyPlanner, MySettings)`` and likewise.
+    """Offer factories, for example ``registry.planner("mine", MyPlanner, MySettings)``.
 
-    Called once, when the plugin is loaded. Do no I/O and import no vendor
-    package here; a device's ``open()`` is the place for both.
+    Called once, when the plugin is loaded. Do no I/O and import no vendor package here. Both belong in a
+    device's ``open()``.
     """
 
 
 @hookspec
 def labseq_run_started(run: RunRecord) -> None:
-    """A run has started: all devices are open and no shot has been taken.
+    """A run has started, with all devices open and no shot taken yet.
 
     A failure is logged with the plugin's name and never stops the run.
     """
@@ -42,7 +41,7 @@ def labseq_run_started(run: RunRecord) -> None:
 
 @hookspec
 def labseq_shot_finished(shot: ShotRecord) -> None:
-    """A shot is on disk. Called between shots; be quick.
+    """A shot is on disk. Called between shots, so be quick.
 
     A failure is logged with the plugin's name and never stops the run.
     """
@@ -50,7 +49,7 @@ def labseq_shot_finished(shot: ShotRecord) -> None:
 
 @hookspec
 def labseq_run_finished(run: RunRecord) -> None:
-    """A run has ended, in whatever way; all devices are in their safe state.
+    """A run has ended for any reason, and all devices are in their safe state.
 
     A failure is logged with the plugin's name and never stops the run.
     """

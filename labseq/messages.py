@@ -1,4 +1,4 @@
-"""Wording of error messages: values as the user wrote them, lists of names, the nearest name."""
+"""Parts of error messages, such as values as the user wrote them, lists of names and the nearest name."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ MAX_ERROR: Final = 2000
 
 
 def install_hint(extra: str, package: str = "labseq") -> str:
-    """The command that installs a package here; environments that uv made have no pip of their own.
+    """The command that installs a package here, which is ``uv pip`` in environments that have no pip.
 
     Args:
-        extra: The extra of the package, for example "plot"; "" for the package alone.
+        extra: The extra of the package, for example "plot". "" for the package alone.
         package: Its name.
     """
     requirement = f"'{package}[{extra}]'" if extra else package
@@ -28,16 +28,16 @@ def install_hint(extra: str, package: str = "labseq") -> str:
 
 
 def missing_package(package: str, extra: str = "") -> str:
-    """Why a device cannot be simulated without a Python package; "" if the package is installed.
+    """Message that a simulated device needs a Python package, or "" if the package is installed.
 
     Args:
-        package: Its name when it is imported.
-        extra: The extra of labseq that installs it; "" if it is installed by its own name.
+        package: Its import name.
+        extra: The extra of labseq that installs it. "" if it is installed by its own name.
     """
     if find_spec(package) is not None:
         return ""
     install = install_hint(extra) if extra else install_hint("", package)
-    return f"the Python package '{package}' is not installed, which the simulated device needs ({install})"
+    return f"the simulated device needs the Python package '{package}', which is not installed ({install})"
 
 
 def visible(text: str) -> str:
@@ -51,7 +51,7 @@ def clean(text: str) -> str:
 
 
 def error_text(error: BaseException) -> str:
-    r"""The text of an error: one line of limited length, "" if it has none.
+    r"""The text of an error, on one line of limited length, or "" if it has none.
 
     Example:
         >>> print(error_text(ValueError("no\nanswer\x1b[2J")))
@@ -61,7 +61,7 @@ def error_text(error: BaseException) -> str:
 
 
 def format_error(error: BaseException) -> str:
-    """Kind and text of an error, see :func:`error_text`; of a group, also those of its first error.
+    """Kind and text of an error. For a group, its first error is appended.
 
     Example:
         >>> format_error(KeyError("typo"))
@@ -75,15 +75,15 @@ def format_error(error: BaseException) -> str:
 
 
 def format_plugin_error(error: BaseException) -> str:
-    """The same of an error in a plugin's code, with its file and line: "KeyError: 'typo' (mine.py:7)"."""
+    """Kind and text of an error in a plugin, with the file and line, as in "KeyError: 'typo' (mine.py:7)"."""
     return format_error(error) + _plugin_line(error)
 
 
 def _plugin_line(error: BaseException) -> str:
-    """The last line of a plugin's code that an error came through, as " (FILE:LINE)"; "" if none."""
+    """The last line of plugin code in the traceback, as " (FILE:LINE)", or "" if there is none."""
     for frame, line in reversed([*traceback.walk_tb(error.__traceback__)]):
         names = accumulate(str(frame.f_globals.get("__name__", "")).split("."), "{}.{}".format)
-        # what every plugin's module states, and nothing else does
+        # every plugin's module has this attribute, and no other module does
         if any(hasattr(sys.modules.get(name), "LABSEQ_API") for name in names):
             return f" ({visible(frame.f_code.co_filename)}:{line})"
     return ""
@@ -100,7 +100,7 @@ def shown(value: Any, raw: str = "") -> str:
 
     Args:
         value: The value.
-        raw: The value as it is written in the file; used for numbers.
+        raw: The value as it is written in the file. Only used for numbers.
 
     Example:
         >>> shown("45 ms"), shown(True), shown([1, 2]), shown(None)
@@ -118,7 +118,7 @@ def shown(value: Any, raw: str = "") -> str:
 
 
 def listing(names: Iterable[str]) -> str:
-    """The known names: "one of rows, cols"; the first of very many."""
+    """The known names as "one of rows, cols". A very long list is cut off."""
     all_names = list(names)
     more = [f"and {len(all_names) - _MAX_LISTED} more"] if len(all_names) > _MAX_LISTED + 1 else []
     return ("one of " if len(all_names) > 1 else "") + ", ".join(
@@ -127,9 +127,9 @@ def listing(names: Iterable[str]) -> str:
 
 
 def closest(name: str, names: Iterable[str], most: int | None = 300) -> str:
-    """The known name with the most similar spelling, ignoring case and dashes; "" if none is similar.
+    """The known name with the most similar spelling, ignoring case and dashes, or "" if none is similar.
 
-    Comparing takes 10 us for each name, so at most ``most`` are compared; None for all.
+    Comparing takes 10 us for each name, so at most ``most`` names are compared. None compares all.
     """
     folded = {candidate.lower().replace("-", "_"): candidate for candidate in islice(names, most)}
     matches = difflib.get_close_matches(name.lower().replace("-", "_")[:_MAX_LENGTH], folded, n=1)
@@ -137,7 +137,7 @@ def closest(name: str, names: Iterable[str], most: int | None = 300) -> str:
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
-    """A hint at the known name with the most similar spelling, or "".
+    """The question whether the most similar known name was meant, or "" if none is similar.
 
     Example:
         >>> did_you_mean("winow", ["cycles", "window"])
