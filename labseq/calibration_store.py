@@ -1,4 +1,4 @@
-"""Stores calibrations on disk, and records which are in use."""
+"""Stores calibrations on disk and records which are in use."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from labseq.units import format_quantity
 
 FORMAT: Final = "labseq-calibration"
 FORMAT_VERSION: Final = "2.0"
-"""major.minor; this labseq reads files of the same major version."""
+"""major.minor. This labseq reads files of the same major version."""
 
 SUFFIX: Final = ".json"
 PICTURE_SUFFIX: Final = ".png"
@@ -45,14 +45,14 @@ def stem_of(entry: CalibrationEntry) -> str:
 
 
 def age_s(entry: CalibrationEntry) -> float | None:
-    """Time since a calibration was made, in seconds; None if this computer's clock is behind that time."""
+    """Time since a calibration was made, in seconds. None if this computer's clock is behind that time."""
     age_s = (now() - datetime.fromisoformat(entry.taken_utc)).total_seconds()
     # the clocks of two computers may differ by a minute
     return None if age_s < -60.0 else max(0.0, age_s)
 
 
 def encode_entry(entry: CalibrationEntry) -> bytes:
-    """The content of an entry's file; floats are exact."""
+    """The content of an entry's file, with exact floats."""
     quality = {name: value if math.isfinite(value) else None for name, value in entry.quality.items()}
     content = {
         "format": FORMAT,
@@ -93,7 +93,7 @@ def read_entry(path: Path) -> CalibrationEntry:
         raise damaged(path, str(error)) from error
     if entry.id != content.get("id"):
         fault = f"its id is {content.get('id')}, but the id of its content is {entry.id}"
-        raise damaged(path, f"{fault}: it was changed by hand")
+        raise damaged(path, f"{fault}, so it was changed by hand")
     return entry
 
 
@@ -139,8 +139,8 @@ class Activation:
 
     Attributes:
         kind: Its kind.
-        id: Id of the new calibration; "" for none from then on.
-        file: Name of its file in the store; "" for none.
+        id: Id of the new calibration. "" for none from then on.
+        file: Name of its file in the store. "" for none.
         since_utc: ISO 8601, UTC.
     """
 
@@ -158,10 +158,10 @@ def encode_history(history: list[Activation]) -> bytes:
 
 
 def check_grid(entry: CalibrationEntry, grid: SiteGrid, source: str) -> None:
-    """Raise if an entry, which came from ``source``, is for another grid.
+    """Check that an entry, which came from ``source``, is for this grid.
 
     Raises:
-        ConfigError: It is for another grid; the message names both.
+        ConfigError: It is for another grid. The message names both.
     """
     if not entry.is_for(grid):
         message = f"{entry.kind} {entry.id} is for another grid: {grid_text(entry.grid)}"
@@ -199,14 +199,14 @@ class Stored:
 
     @property
     def picture(self) -> Path | None:
-        """Path of its picture; None if there is none."""
+        """Path of its picture, or None if there is none."""
         path = self.path.with_suffix(PICTURE_SUFFIX)
         return path if path.is_file() else None
 
 
 @dataclass(frozen=True, slots=True)
 class Damaged:
-    """A file of a store that cannot be read: kind and id from its name, and the error."""
+    """A file of a store that cannot be read, with kind and id from its name, and the error."""
 
     path: Path
     kind: str
@@ -217,8 +217,8 @@ class Damaged:
 class Store:
     """A folder of calibrations, which is created with the first entry.
 
-    An entry is a JSON file, and a picture of the same name. They never change. The same values
-    measured again have another id. Several processes may use a store at the same time.
+    An entry is a JSON file with a picture of the same name. Neither ever changes. The same values measured
+    again get another id. Several processes may use a store at the same time.
 
     Args:
         folder: The folder.
@@ -260,14 +260,14 @@ class Store:
             message = (
                 f"there is no calibration{f' of {kind}' if kind else ''} '{id_or_file}' in {self.folder}"
             )
-            raise ConfigError(Problem(message, expected=", ".join(near) or "one that was made before"))
+            raise ConfigError(Problem(message, expected=", ".join(near) or "an existing calibration"))
         read = self._read(*matches[-1])
         if isinstance(read, Damaged):
             raise read.error
         return read
 
     def add(self, entry: CalibrationEntry, picture: bytes | None = None) -> Stored:
-        """Store an entry and a PNG of it; this does not put it to use.
+        """Store an entry and a PNG of it, without putting it to use.
 
         Raises:
             ConfigError: The folder cannot be written to.
@@ -285,7 +285,7 @@ class Store:
         raise AssertionError  # count() does not end
 
     def history(self) -> list[Activation]:
-        """Every activation, in order; the last one of a kind is active. Empty without a store.
+        """Every activation, in order. The last of each kind is active. Empty without a store.
 
         Raises:
             ConfigError: ``active.json`` is damaged, or written by a newer labseq.
@@ -313,7 +313,7 @@ class Store:
         return {kind: activation for kind, activation in last.items() if activation.id}
 
     def entry_in_use(self, kind: str) -> Stored | None:
-        """The entry of a kind that is in use; None if there is none.
+        """The entry of a kind that is in use, or None if there is none.
 
         Raises:
             ConfigError: It is missing or damaged, or ``active.json`` is damaged.
@@ -325,12 +325,12 @@ class Store:
         """The entry that was put to use.
 
         Raises:
-            ConfigError: It is missing, damaged, or another one than then.
+            ConfigError: It is missing, damaged or no longer the same calibration.
         """
         path = self.folder / active.file
         entry = read_entry(path)
         if (entry.kind, entry.id) != (active.kind, active.id):
-            fault = f"{active.id} was put to use as '{active.kind}', and this is another calibration"
+            fault = f"{active.id} was put to use as '{active.kind}', but this is another calibration"
             raise damaged(path, fault)
         return Stored(entry, path)
 
@@ -377,7 +377,7 @@ class Store:
             if path.exists():
                 raise FileExistsError
             file.write(encode_entry(entry))
-            if picture is not None:  # written before the entry gets its name: an entry has its picture
+            if picture is not None:  # written before the entry gets its name, so that no entry lacks it
                 with whole_file(path.with_suffix(PICTURE_SUFFIX)) as png:
                     png.write(picture)
 
@@ -395,7 +395,7 @@ class Store:
         try:
             entry = read_entry(path)
             if (entry.kind, entry.id) != (name[1], name[3]):
-                raise damaged(path, f"it contains {entry.kind} {entry.id}: it was renamed")
+                raise damaged(path, f"it was renamed, because it contains {entry.kind} {entry.id}")
         except ConfigError as error:
             return Damaged(path, name[1], name[3], error)
         return Stored(entry, path)
@@ -406,5 +406,5 @@ class Store:
             yield
         except OSError as error:
             message = f"calibrations cannot be stored there: {error.strerror or error}"
-            hint = "name another folder with the profile's key 'calibrations'"
+            hint = "set another folder in the profile's key 'calibrations'"
             raise ConfigError(Problem(message, str(self.folder), hint=hint)) from error

@@ -1,8 +1,8 @@
-"""Workers of a dask cluster; needs the extra `labseq[campaign]`.
+"""Workers of a dask cluster, for which the extra `labseq[campaign]` is needed.
 
 Each worker process prepares itself when it gets its first task, and again after it was restarted. Between
-machines everything is encrypted, and only machines with a certificate of the cluster take part: dask workers
-carry out whatever code they are sent.
+machines everything is encrypted, and only machines with a certificate of the cluster take part, because dask
+workers carry out any code they are sent.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ _ADDRESS: Final = re.compile(r"(tls|tcp)://(\[[0-9a-fA-F:.]+\]|[^\s/:\[\]]+):(\d
 _ANSWER_S: Final = 10.0
 """Time for the scheduler to answer, in seconds."""
 _JOIN_S: Final = 30.0
-"""Time for a worker to join a cluster without one, in seconds."""
+"""Time for a worker to join a cluster that has none, in seconds."""
 _COUNT_S: Final = 2.0
 """Interval at which the workers are counted, in seconds."""
 
 
 class ClusterWorkers:
-    """The workers of a dask cluster; see :class:`labseq.workers.Workers`.
+    """The workers of a dask cluster. See :class:`labseq.workers.Workers`.
 
     Args:
-        address: Address of its scheduler: "tls://lab-pc:8786", or "tcp://127.0.0.1:8786" on this computer.
-        keys: Folder of the certificates, as `labseq campaign keys` writes it; only for tls.
-        task_name: Names a task in messages: "run".
+        address: Address of its scheduler, as "tls://lab-pc:8786", or "tcp://127.0.0.1:8786" on this computer.
+        keys: Folder of the certificates, as `labseq campaign keys` writes it. Only for tls.
+        task_name: Name of a task in messages, for example "run".
 
     Raises:
         ConfigError: The address is not allowed, a certificate is missing, the scheduler does not answer, no
@@ -67,7 +67,7 @@ class ClusterWorkers:
 
     @property
     def n_workers(self) -> int:
-        """Number of workers now; at least 1, for others may join.
+        """Number of workers now. At least 1, because others may join.
 
         Raises:
             LabseqError: The scheduler does not answer, or there has been no worker for some time.
@@ -86,11 +86,11 @@ class ClusterWorkers:
         return max(1, self._n)
 
     def prepare(self, make: Make, recipe: Any) -> None:
-        """Keep it for workers that have not been prepared."""
+        """Keep the recipe for workers that have not been prepared."""
         self._pack = pickle.dumps((make, recipe))
 
     def submit(self, task: int, argument: Any) -> None:
-        """Hand out a task; earlier ones come first."""
+        """Hand out a task. Earlier tasks come first."""
         self._arguments[task] = argument
         self._send(task, None)
 
@@ -117,7 +117,7 @@ class ClusterWorkers:
             raise self._error(task, future.exception())
         try:
             answer = future.result(timeout=_ANSWER_S)
-        except Exception:  # noqa: BLE001 - its worker, or the scheduler, is gone: the task is sent again
+        except Exception:  # noqa: BLE001 - its worker or the scheduler is gone, so the task is sent again
             self._send(task, self._pack)
             return []
         if answer is None:
@@ -131,7 +131,7 @@ class ClusterWorkers:
             return error
         if type(error).__name__ == "KilledWorker":
             cause = f"{self._task_name} {task} has ended several workers of the cluster"
-            return LabseqError(f"{cause}; perhaps the memory was used up: see their logs")
+            return LabseqError(f"{cause}; see their logs, the memory may be used up")
         return LabseqError(f"a worker of the cluster failed, perhaps without labseq: {format_error(error)}")
 
     def close(self) -> None:
@@ -147,7 +147,7 @@ class ClusterWorkers:
 
 
 def check_workers(n_workers: int | None, scheduler: str | None) -> None:
-    """Refuse a number of processes together with a cluster, and an address as :func:`check_address` does.
+    """Check that the work goes to processes here or to a cluster, not both, and check the address.
 
     Raises:
         ConfigError: It is refused.
@@ -169,9 +169,9 @@ def check_address(address: str) -> None:
     """
     match = _ADDRESS.fullmatch(address)
     if match is None:
-        raise _problem(address, "this is not an address of a scheduler", "tls://HOST:PORT")
+        raise _problem(address, "this is not the address of a scheduler", "tls://HOST:PORT")
     if match[1] == "tcp" and not is_loopback(match[2].strip("[]")):
-        danger = "without encryption, anybody on the network could have the workers run code"
+        danger = "without encryption, anybody on the network could run code on the workers"
         raise _problem(address, danger, "tls://HOST:PORT", "'labseq campaign keys' makes the certificates")
 
 
@@ -232,10 +232,10 @@ _prepared: Final[dict[str, Do]] = {}
 def _carry_out(run: str, version: str, argument: Any, pack: bytes | None) -> Any:
     """Carry out a task on a worker.
 
-    Whatever the worker's number of threads, one task is in work at a time.
+    A worker carries out one task at a time, even if it has several threads.
 
     Returns:
-        The result; None if the worker is not prepared and was not given the recipe.
+        The result, or None if the worker is not prepared and was not given the recipe.
 
     Raises:
         ConfigError: It has another version of labseq.

@@ -23,7 +23,7 @@ from labseq.plain import dumps, parse_object
 
 @contextmanager
 def whole_file(path: Path, *, alone: bool = False) -> Generator[IO[bytes]]:
-    """Write a file that gets its name only when it is whole and on the disk.
+    """Write a file that gets its name only when it is complete and on the disk.
 
     It is written as ``<name>.part``, flushed to the disk and renamed. Until then an older file of that name
     stays as it is. If the path is a link, the file that it points to is replaced. A pipe or another special
@@ -31,13 +31,13 @@ def whole_file(path: Path, *, alone: bool = False) -> Generator[IO[bytes]]:
 
     Args:
         path: The file.
-        alone: Refuse while another process writes the same file in this way; values read
-            in the block are then still valid when the file gets its name.
+        alone: Refuse while another process writes the same file in this way, so that values read in the block
+            are still valid when the file gets its name.
 
     Raises:
-        FileExistsError: ``alone``, and another process writes it; ``filename`` is the ``.part`` file, which
-            a killed process leaves behind.
-        OSError: It cannot be written; no ``.part`` file is left.
+        FileExistsError: ``alone`` is set and another process writes the file. ``filename`` is the ``.part``
+            file, which a killed process leaves behind.
+        OSError: It cannot be written. No ``.part`` file is left.
     """
     if path.exists() and not path.is_file():
         with path.open("wb") as file:
@@ -62,7 +62,7 @@ def whole_file(path: Path, *, alone: bool = False) -> Generator[IO[bytes]]:
 
 
 def _give_name(part: Path, real: Path) -> None:
-    """Rename a file that is whole; on Windows, wait until no program reads the file that it replaces."""
+    """Rename a complete file. On Windows, wait until no program reads the file that it replaces."""
     attempts = 400 if os.name == "nt" else 1  # readers hold a file open for milliseconds
     for attempt in range(1, attempts + 1):
         try:
@@ -108,11 +108,11 @@ def free_bytes(folder: Path) -> int:
 
 
 def make_folder(path: Path, *, is_new: bool = False) -> None:
-    """Make a folder, and those above it, in which the group may write if it may in the folder around it.
+    """Make a folder and its parents, writable for the group if the folder around it is.
 
     Args:
         path: The folder.
-        is_new: Whether there must be no such folder yet.
+        is_new: True if the folder must not exist yet.
 
     Raises:
         OSError: It cannot be made.
@@ -131,7 +131,7 @@ def make_folder(path: Path, *, is_new: bool = False) -> None:
 def share_with_group(path: Path) -> None:
     """Let the group write to a new file or folder if it may write to the folder around it.
 
-    The usual umask would leave the folder of a day to the user whose run is the first.
+    With the usual umask, only the user with the first run of a day could write to the folder of that day.
     """
     with suppress(OSError):
         around, own = path.parent.stat(), path.stat()
@@ -144,8 +144,8 @@ _ADVICE: Final = {
     errno.ENOSPC: f"the disk is full; free some space, or {_ELSEWHERE}",
     errno.EDQUOT: f"your disk quota is used up; free some space, or {_ELSEWHERE}",
     errno.EROFS: f"the disk is read-only; {_ELSEWHERE}",
-    errno.ENOTDIR: f"a file is in the way of a folder; move it, or {_ELSEWHERE}",
-    errno.EEXIST: f"a file is in the way of a folder; move it, or {_ELSEWHERE}",
+    errno.ENOTDIR: f"a file has the name of a folder; move it, or {_ELSEWHERE}",
+    errno.EEXIST: f"a file has the name of a folder; move it, or {_ELSEWHERE}",
     errno.ENOENT: "the folder is gone; do not move or delete a run while it is written",
     errno.EIO: f"the disk reports a fault; check it and its cable, or {_ELSEWHERE}",
 }
@@ -169,7 +169,7 @@ def explained(path: Path) -> Generator[None]:
 
 
 def _whose(path: Path) -> str:
-    """Who may let others write to a file or its folder; "" if this user may, or if that is unknown."""
+    """Advice on who can give write permission, or "" if this user may write or that is unknown."""
     with suppress(OSError, NotImplementedError):
         existing = next(place for place in (path, *path.parents) if place.exists())
         owner = f"user {existing.stat().st_uid}"
@@ -177,7 +177,7 @@ def _whose(path: Path) -> str:
             owner = existing.owner()
         if not os.access(existing, os.W_OK):
             who = f"{existing} belongs to {owner}"
-            return f"{who}, who can let the group write with 'chmod -R g+w {existing}'; or "
+            return f"{who}, who can let the group write with 'chmod -R g+w {existing}', or "
     return ""
 
 
@@ -189,7 +189,7 @@ def check_ordinary(path: Path) -> None:
     """Raise for a pipe or a device, which could block for ever.
 
     Raises:
-        OSError: It is one of them, or nothing is there.
+        OSError: It is a pipe or a device, or nothing is there.
     """
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, "this is not an ordinary file")
@@ -228,8 +228,8 @@ def is_there(path: Path) -> bool:
     """Whether there is anything at a path.
 
     Raises:
-        OSError: There cannot be, as the name is too long, or it cannot be told; ``Path.exists`` hides that
-            from Python 3.14 on.
+        OSError: The name is too long, or the answer cannot be found out. From Python 3.14 on ``Path.exists``
+            hides such errors.
     """
     try:
         path.stat()
@@ -239,7 +239,7 @@ def is_there(path: Path) -> bool:
 
 
 def lines_in(path: Path, start: int = 0, longest: int = MAX_LINE) -> Generator[bytes]:
-    r"""The lines of a file from a byte on, with their ends; the last one may lack its "\n".
+    r"""The lines of a file from a byte on, with their ends. The last line may lack its "\n".
 
     Raises:
         RecordingError: It cannot be read, or a line is too long.
@@ -259,11 +259,11 @@ def lines_in(path: Path, start: int = 0, longest: int = MAX_LINE) -> Generator[b
 class LineLog:
     """An append-only file of JSON lines. Only lines that end with a newline count.
 
-    A line that a killed process left unfinished is kept as a separate line. An append that failed in this
-    process leaves nothing: the next one overwrites it.
+    A line that a killed process left unfinished is kept as a separate line. If an append fails in this
+    process, the next one overwrites it.
 
     Args:
-        path: The file; it is made if it does not exist.
+        path: The file, which is made if it does not exist.
 
     Raises:
         RecordingError: The file cannot be made or read.
@@ -280,10 +280,10 @@ class LineLog:
                 self._length += file.write(b"\n")
 
     def append(self, values: object, *, sync: bool) -> None:
-        """Add a line; ``sync`` waits until it is on the disk.
+        """Add a line. ``sync`` waits until it is on the disk.
 
         Raises:
-            RecordingError: It could not be written; the file is unchanged.
+            RecordingError: It could not be written. The file is unchanged.
         """
         line = dumps(values).encode() + b"\n"
         with explained(self.path), self.path.open("r+b", buffering=0) as file:
@@ -311,8 +311,8 @@ def read_lines(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
     """Read a file of JSON lines, even if it is damaged.
 
     Returns:
-        The complete lines, and the numbers (from 1) of damaged lines. An unfinished last line is
-        neither: it was never reported as written. Both are empty if there is no file.
+        The complete lines, and the numbers (from 1) of damaged lines. An unfinished last line is in neither,
+        because it was never reported as written. Both are empty if there is no file.
 
     Raises:
         RecordingError: The file exists but cannot be read.
@@ -328,7 +328,7 @@ class NewLines:
     """Reads the lines that are appended to a file of JSON lines.
 
     Args:
-        path: The file; it need not exist yet.
+        path: The file, which need not exist yet.
         longest: Longest line, in bytes.
     """
 
@@ -338,7 +338,7 @@ class NewLines:
         self._at, self._inode = 0, 0
 
     def placed(self) -> Generator[tuple[int, dict[str, Any] | None]]:
-        """The lines since the last call: where each begins in the file, and its values; None if damaged.
+        """The lines since the last call, as position in the file and values (None if damaged).
 
         Raises:
             RecordingError: The file cannot be read.
@@ -400,7 +400,7 @@ def packaged_sequences_dir() -> Path:
 
 
 def profile_dir(profile: Path) -> Path:
-    """The folder for data of a profile, such as its calibrations: the folder of the profile's file.
+    """The folder of the profile's file, for data of the profile such as its calibrations.
 
     For a profile that comes with labseq it is ./hardware_profiles, where a copy of the profile would be,
     because its file is used from other working folders as well.
@@ -417,7 +417,7 @@ def data_root() -> Path:
 def state_root() -> Path | None:
     """Folder of the data that labseq keeps for this user between runs.
 
-    ``LABSEQ_STATE`` if set, else the platform's folder for state; None for a user without a home.
+    ``LABSEQ_STATE`` if set, else the platform's folder for state. None for a user without a home.
     """
     import platformdirs
 

@@ -1,4 +1,4 @@
-"""Any value as plain JSON: what run.json, the index, the event log and JSON texts are made of."""
+"""Turns any value into plain JSON for run.json, the index, the event log and other JSON texts."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ _MAX_PARTS: Final = 500_000
 
 
 def to_plain(value: Any) -> Any:
-    """Turn any value into one that JSON can hold; never raises.
+    """Turn any value into a value that JSON can hold. Never raises.
 
-    nan and infinities become None, numpy scalars and arrays plain numbers and
-    lists, keys text. A dataclass becomes what its ``as_json()`` returns, or a mapping of its
-    fields. Anything else becomes its ``repr``.
+    nan and infinities become None, numpy scalars and arrays plain numbers and lists, keys text. A dataclass
+    becomes the result of its ``as_json()``, or a mapping of its fields. Anything else becomes its ``repr``.
 
     Example:
         >>> import numpy as np
@@ -32,17 +31,17 @@ def to_plain(value: Any) -> Any:
 
 
 def now() -> datetime:
-    """The computer's clock; it may be set at any time, so that durations need a monotonic one."""
+    """The computer's clock. It may be set at any time, so durations need a monotonic clock."""
     return datetime.fromtimestamp(time.time(), UTC)
 
 
 def now_utc(timespec: str = "microseconds") -> str:
-    """The same as text for time stamps, ISO 8601, UTC."""
+    """The computer's clock as text for time stamps, ISO 8601, UTC."""
     return now().isoformat(timespec=timespec)
 
 
 def dumps(value: Any, *, indent: int | None = None) -> str:
-    """Any value as JSON, by way of :func:`to_plain`; one line unless indented.
+    """Any value as JSON, by way of :func:`to_plain`, on one line unless indented.
 
     Example:
         >>> dumps({"t_s": float("inf")})
@@ -54,7 +53,7 @@ def dumps(value: Any, *, indent: int | None = None) -> str:
 
 
 def plain_text(text: str) -> str:
-    r"""Text that every file format takes: no NUL characters and no lone surrogates.
+    r"""Text that every file format accepts, without NUL characters and lone surrogates.
 
     Example:
         >>> print(plain_text("a\0b"))
@@ -115,7 +114,7 @@ def _repr(value: Any) -> str:
 
 
 def parse_object(data: bytes) -> dict[str, Any] | None:
-    """Read a JSON object; None if it is anything else, nested too deep, or of too many parts."""
+    """Read a JSON object. None if it is anything else, is nested too deep, or has too many parts."""
     if data[:1].isalnum():  # a million of such lines would take 10 s
         return None
     try:
@@ -126,7 +125,7 @@ def parse_object(data: bytes) -> dict[str, Any] | None:
 
 
 def parse_value(data: bytes | str) -> Any:
-    """Read JSON of limited depth and size: at most 32 levels, and 500,000 lists and objects.
+    """Read JSON with at most 32 levels and 500,000 lists and objects.
 
     Raises:
         ValueError: It is not JSON, is nested deeper, or has more parts.

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """A process, identified by its id and its start, because ids are used again.
+    """A process, identified by its id and its start time, because ids are used again.
 
     Attributes:
         pid: Process id.
-        started: When it started: on Linux in seconds since the computer did, which no change of the
-            clock moves, elsewhere since 1970; 0 if that is unknown.
+        started: Its start time, in seconds since the start of the computer on Linux, where changes of the
+            clock do not matter, and since 1970 elsewhere. 0 if unknown.
         host: The computer that it runs on.
-        boot: Which start of the computer; "" if unknown.
+        boot: Id of the computer's last start, or "" if unknown.
     """
 
     pid: int
@@ -49,7 +49,7 @@ class Process:
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> Process | None:
-        """A process from the result of ``dataclasses.asdict``; None for any other value."""
+        """A process from the result of ``dataclasses.asdict``, or None for any other value."""
         pid, started = values.get("pid"), values.get("started", 0.0)
         if type(pid) is not int or pid <= 0 or type(started) not in (int, float):
             return None
@@ -62,7 +62,7 @@ class Process:
 
     @property
     def is_running(self) -> bool:
-        """Whether it still runs; only known on its own computer."""
+        """Whether it still runs. Only known on its own computer."""
         if self.boot and self.boot != _boot_id():
             return False
         started = _start_time(self.pid)
@@ -73,7 +73,7 @@ class Process:
         return not (self.started and started) or abs(started - self.started) < tolerance_s
 
     def end(self, grace_s: float) -> bool:
-        """End it: SIGTERM, and SIGKILL if it has not ended within the grace time.
+        """End it with SIGTERM, or with SIGKILL if it has not ended within the grace time.
 
         Returns:
             Whether it has ended.
@@ -100,7 +100,7 @@ def _boot_id() -> str:
 
 
 def _start_time(pid: int) -> float | None:
-    """When a process started, see :class:`Process`; None without such a process, 0 if hidden."""
+    """Start time of a process, as in :class:`Process`. None if there is no such process, 0 if hidden."""
     if sys.platform == "linux":
         return _start_since_boot(pid)
     import psutil  # takes 0.03 s to import
@@ -115,7 +115,7 @@ def _start_time(pid: int) -> float | None:
 
 
 def _start_since_boot(pid: int) -> float | None:
-    """The same on Linux, by proc(5), whose times do not follow the clock."""
+    """Start time of a process on Linux, from proc(5), whose times do not follow the clock."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()
         has_ended = fields[0] in "ZXx" and int(fields[17]) <= 1  # other threads still hold its files
@@ -131,7 +131,7 @@ def _start_since_boot(pid: int) -> float | None:
 
 
 HANG_S: Final = 5.0
-"""A process hangs if it has given no sign of life for this long; those that use devices give two a second."""
+"""A process without a sign of life for this long hangs. Processes that use devices give two a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,10 +139,10 @@ class Holder:
     """The process that holds a lock.
 
     Attributes:
-        purpose: For example "the run data/2026-01-02/0001_compact"; "" if unknown.
-        process: The process; None if unknown.
+        purpose: For example "the run data/2026-01-02/0001_compact". "" if unknown.
+        process: The process, or None if unknown.
         since_utc: Since when, ISO 8601, UTC.
-        silent_s: Time since its last sign of life; 0 if it gives none.
+        silent_s: Time since its last sign of life. 0 if it gives none.
     """
 
     purpose: str = ""
@@ -168,13 +168,13 @@ class Holder:
 
 
 class Lock:
-    """A lock of the operating system on a file; it is released when its process ends, even if killed.
+    """A lock of the operating system on a file, released when its process ends, even if it is killed.
 
-    ``<file>.holder`` next to the file describes the process that holds it. The time of that file, on the
-    system's monotonic clock, is its last sign of life.
+    ``<file>.holder`` next to the file describes the process that holds it. The time stamp of that file, on
+    the system's monotonic clock, is the last sign of life of the process.
 
     Args:
-        path: The file; it and its folder are made if they do not exist, and stay.
+        path: The file. It and its folder are made if they do not exist, and stay.
         purpose: Purpose of the lock, shown to other processes.
     """
 
@@ -188,7 +188,7 @@ class Lock:
         """Take the lock if it is free.
 
         Args:
-            warn: Receives a message if the folder, perhaps on a network, has no locks; without `warn` that is
+            warn: Receives a message if the folder, perhaps on a network, has no locks. Without `warn` that is
                 an error.
 
         Returns:
@@ -212,7 +212,7 @@ class Lock:
             no_locks = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP}
             if warn is None or failure.errno not in no_locks:
                 raise failure from error
-            warn(f"{self.path.parent} does not support file locks: another process could work there, too")
+            warn(f"{self.path.parent} does not support file locks, so another process could work there, too")
             return None
         self._lock = lock
         self.describe(self._holder.purpose)
@@ -232,18 +232,18 @@ class Lock:
             os.utime(self._about, ns=(time.monotonic_ns(), time.monotonic_ns()))
 
     def release(self) -> None:
-        """Free the lock; legal at any time."""
+        """Free the lock. Legal at any time."""
         if self._lock is not None:
             with suppress(OSError):
                 try:
                     self._about.unlink(missing_ok=True)
-                except PermissionError:  # another user's: its folder lets only that user delete it
+                except PermissionError:  # it belongs to another user, and only that user may delete it
                     write_shared(self._about, b"")
             self._lock.release()
             self._lock = None
 
     def holder(self) -> Holder | None:
-        """The process that holds the lock, or died holding it; None if there is none or it is unknown."""
+        """The process that holds the lock, or died holding it. None if there is none or it is unknown."""
         try:
             values = parse_object(read_file(self._about)) or {}
             silent_s = max(0.0, time.monotonic() - self._about.stat().st_mtime)
@@ -260,7 +260,7 @@ def _local(time_utc: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this computer can reach an address; a name of a host counts as reachable by others.
+    """Whether only this computer can reach an address. Host names count as reachable by others.
 
     Example:
         >>> is_loopback("127.0.0.1"), is_loopback("::1"), is_loopback("localhost"), is_loopback("0.0.0.0")

@@ -1,8 +1,8 @@
 """Priority, locked memory and awake processors between a frame and the moves, where the system grants them.
 
 A thread with the policy SCHED_FIFO is not interrupted by other programs, locked memory is never moved to the
-disk, and a processor that does not fall asleep during an exposure keeps its caches and answers at once. Linux
-grants the first two to root, and to users by ``/etc/security/limits.d``; the third to those who may write to
+disk, and a processor kept out of deep sleep during an exposure keeps its caches and answers at once. Linux
+grants the first two to root, and to users by ``/etc/security/limits.d``. The third needs write access to
 ``/dev/cpu_dma_latency``. On other systems nothing is changed.
 """
 
@@ -17,19 +17,19 @@ from pathlib import Path
 from typing import Final
 
 SWITCH_S: Final = 0.2e-3
-"""How long a thread may keep Python to itself while another waits; Python's own default is 5 ms."""
+"""How long a thread may keep Python to itself while another waits. Python's own default is 5 ms."""
 LIMITS: Final = "'@GROUP - rtprio 22' and '@GROUP - memlock unlimited' in a file in /etc/security/limits.d"
 LATENCY: Final = Path("/dev/cpu_dma_latency")
-"""While it is open, processors sleep only as deeply as they can wake within the time written to it, in us."""
+"""While this file is open, processors only sleep so deeply that they wake within the written time, in us."""
 UDEV: Final = """KERNEL=="cpu_dma_latency", GROUP="GROUP", MODE="0660" in a file in /etc/udev/rules.d"""
 IDLE_DRIVER: Final = Path("/sys/devices/system/cpu/cpuidle/current_driver")
 
 
 def raise_priority(above: int = 0) -> bool:
-    """Give this thread priority over all ordinary programs; returns whether the system allows it.
+    """Give this thread priority over all ordinary programs. Returns whether the system allows it.
 
     Args:
-        above: How far above the thread of a shot's steps; it must not keep others from feeding a device.
+        above: How far above the thread of a shot's steps, which must not keep others from feeding a device.
     """
     # 20 is above all ordinary programs, and below the kernel's own threads, which have 50
     return any(_set_scheduler("SCHED_FIFO", 20 + more) for more in dict.fromkeys((above, 0)))
@@ -53,7 +53,7 @@ def _set_scheduler(policy: str, priority: int) -> bool:
 
 @contextmanager
 def real_time() -> Generator[None]:
-    """Lock the memory, let waiting threads have Python soon, and keep the processors awake meanwhile."""
+    """Lock the memory, switch threads quickly and keep the processors awake within the block."""
     with ExitStack() as stack:
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(SWITCH_S)
@@ -65,7 +65,7 @@ def real_time() -> Generator[None]:
 
 
 def lock_memory() -> bool:
-    """Keep the memory of this process out of the swap space; returns whether the system allows it."""
+    """Keep the memory of this process out of the swap space. Returns whether the system allows it."""
     if sys.platform != "linux":
         return False
     import resource
@@ -79,14 +79,14 @@ def lock_memory() -> bool:
 
 
 def may_stay_awake() -> bool:
-    """Whether the system lets this process keep the processors awake, or has no states of sleep at all."""
+    """Whether this process may keep the processors awake, or the system has no sleep states at all."""
     with suppress(OSError):
         return IDLE_DRIVER.read_text("ascii").strip() == "none" or os.access(LATENCY, os.W_OK)
     return True
 
 
 def missing_privileges() -> str:
-    """Privileges that this computer does not grant, and how to allow them; "" if none, or not on Linux."""
+    """Warning about privileges that this computer does not grant, with the remedy. "" if none are missing."""
     if sys.platform != "linux":
         return ""
     missing = {
@@ -96,5 +96,5 @@ def missing_privileges() -> str:
     }
     restore_priority()
     names = " and ".join(name for name, remedy in missing.items() if remedy)
-    remedies = "; ".join(dict.fromkeys(filter(None, missing.values())))
-    return f"the moves after a frame may be delayed: no {names}; allow it by {remedies}" if names else ""
+    remedies = " and ".join(dict.fromkeys(filter(None, missing.values())))
+    return f"without {names}, the moves after a frame may be delayed; write {remedies}" if names else ""

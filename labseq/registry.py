@@ -1,4 +1,4 @@
-"""What the installed plugins offer, by kind and name."""
+"""The registry of everything that the installed plugins offer, by kind and name."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ VIRTUAL_TWIN: Final = "virtual"
 """Name under which a plugin offers the virtual twin of a hardware role."""
 
 LOAD_S: Final = 30.0
-"""Default for how long a plugin may take to load, and a constructor to return."""
+"""Default time limit for a plugin to load, and for a constructor to return."""
 
 _NAME: Final = re.compile(r"[^\W\d][\w-]{0,63}")
 
@@ -25,19 +25,19 @@ Factory = Callable[..., Any]
 FactoryOrPlace = Factory | str
 ModelOrPlace = type[Any] | str | None
 Call = Callable[["Owner", str, Callable[[], Any]], Any]
-"""How code of a plugin is run: ``call(owner, what, work)``."""
+"""Function that runs code of a plugin, ``call(owner, what, work)``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Owner:
-    """The plugin that offers something: its name for error messages, and how long to wait for its code.
+    """The plugin that offers something, with its name for error messages and the time limit for its code.
 
     Attributes:
         name: Name of the plugin.
-        source: Its file or its distribution, as text; "" for labseq's own.
-        home: The file or the folder that its code is in; None if that is not known.
-        max_wait_s: How long it may take to load, and a constructor to return.
-        notes: What it printed when it was loaded, or in a constructor.
+        source: Its file or its distribution, as text. "" for labseq's own.
+        home: The file or the folder that its code is in, or None if that is not known.
+        max_wait_s: Time limit for it to load, and for a constructor to return.
+        notes: Its output when it was loaded, or in a constructor.
     """
 
     name: str
@@ -61,22 +61,21 @@ class Entry:
     """One thing that a plugin offers.
 
     Attributes:
-        kind: Name of its role, one of :data:`labseq.roles.ROLES`; or "fit".
+        kind: Name of its role, one of :data:`labseq.roles.ROLES`, or "fit".
         name: The name that a sequence or profile uses.
-        factory: ``factory(settings, context)``; steps: ``factory(settings)``;
-            patterns: ``factory(settings, grid)``; scanners: ``factory(settings, space)``.
-            An installed plugin may give the place of factory, settings and ``simulated`` as text,
-            ``"package.module:Name"``; they are imported when something first needs them.
-        settings_model: pydantic model of its settings, a subclass of
-            ``labseq.plugin.Settings``, or its place; None if it takes none.
+        factory: ``factory(settings, context)``. For steps ``factory(settings)``, for patterns
+            ``factory(settings, grid)``, for scanners ``factory(settings, space)``. An installed plugin may
+            give the place of factory, settings and ``simulated`` as text, ``"package.module:Name"``. They are
+            imported when they are first needed.
+        settings_model: pydantic model of its settings, a subclass of ``labseq.plugin.Settings``, or its
+            place. None if it takes none.
         owner: The plugin that registered it.
-        virtual_time: Whether it keeps to the session's clock only, so that a run
-            need not wait in real time.
-        simulated: Settings that make a driver use its simulated device, for
-            example ``{"card": "simulated"}``; None if it has none. A dry run gives them;
-            a driver that has them keeps to the session's clock. A place may be that of a function
-            that returns them, or a text: why the device cannot be simulated on this computer.
-        no_simulator: Why the device cannot be simulated on this computer; "" if it can.
+        virtual_time: Whether it keeps to the session's clock only, so that a run need not wait in real time.
+        simulated: Settings that make a driver use its simulated device, for example ``{"card":
+            "simulated"}``. None if it has none. A dry run uses them. A driver that has them keeps to the
+            session's clock. A place may lead to a function that returns them, or that returns as text why the
+            device cannot be simulated on this computer.
+        no_simulator: Reason why the device cannot be simulated on this computer, or "" if it can.
         units: Units of the parameters of a fit, see :meth:`Registry.fit`.
     """
 
@@ -107,14 +106,14 @@ class Entry:
 
 
 class Registry:
-    """Filled by the plugins' ``labseq_register``; read by the session.
+    """Everything that plugins offer, added in their ``labseq_register`` and read by the session.
 
-    Every method ``registry.<kind>(name, factory, settings_model)`` adds an entry.
-    A name that is taken is an error that names both origins.
+    Every method ``registry.<kind>(name, factory, settings_model)`` adds an entry. A name that is taken raises
+    an error that names both plugins.
 
     Attributes:
         contested: Kind and name that more than one plugin offers -> the error.
-        used: Kind and name of what was asked for by :meth:`get`, and the plugin that offers it.
+        used: Kind and name of each entry requested by :meth:`get` -> the plugin that offers it.
     """
 
     def __init__(self, call: Call = lambda _owner, _what, work: work()) -> None:
@@ -129,16 +128,16 @@ class Registry:
     def opened_for(self, owner: Owner) -> Generator[Registry]:
         """The registry that a plugin registers with, within the block.
 
-        Nothing of the plugin stays if the block fails.
+        If the block fails, all entries of the plugin are removed.
         """
-        # one for each plugin, so that one that keeps it can be refused later
+        # each plugin gets its own, so that a plugin that keeps it can be refused later
         registry = Registry(self._call)
         registry._owner, registry._entries, registry.contested = owner, self._entries, self.contested
         registry.used = self.used
         try:
             yield registry
         except BaseException:
-            registry._is_closed = True  # first: the thread of a plugin that hung may still go on to register
+            registry._is_closed = True  # first, because the thread of a plugin that hung may still register
             self.forget(owner.name)
             raise
         finally:
@@ -220,9 +219,9 @@ class Registry:
 
         Args:
             name: Its name.
-            factory: Makes the model, or the place of what does.
-            units: Parameter -> its unit: "x" or "y" for those of the scanned value and of the quantity,
-                "1/x", "y/x" or an SI unit.
+            factory: Makes the model, or the place of such a function.
+            units: Parameter -> its unit, which is "x" for the unit of the scanned value, "y" for the unit of
+                the quantity, "1/x", "y/x" or an SI unit.
         """
         self._add("fit", name, factory, None, units=units)
 
@@ -257,7 +256,7 @@ class Registry:
         self._add("lines", name, factory, settings_model, **options)
 
     def find(self, kind: str, name: str) -> Entry | None:
-        """Find an entry, and import whatever it gives only by its place; None if there is no such entry.
+        """Find an entry, and import the parts given only by their place. None if there is no such entry.
 
         Raises:
             PluginLoadError: It cannot be imported.
@@ -278,7 +277,7 @@ class Registry:
         return entry
 
     def get(self, kind: str, name: str) -> Entry:
-        """Find an entry that is going to be used, for a plugin that builds on another one, too.
+        """Find an entry in order to use it. Plugins that build on another plugin call this, too.
 
         Raises:
             UnknownPluginError: There is no such entry.
@@ -295,18 +294,18 @@ class Registry:
         return sorted(name for k, name in self._entries if k == kind)
 
     def offers(self, origin: str | None = None) -> list[tuple[str, str]]:
-        """Kind and name of all entries, or of those of one plugin, sorted; nothing is imported."""
+        """Kind and name of all entries, or of a plugin's entries, sorted. Nothing is imported."""
         keys = [key for key, entry in self._entries.items() if origin in (None, entry.origin)]
         order = [*ROLES, "fit"]
         return sorted(keys, key=lambda key: (order.index(key[0]), key[1]))
 
     def entries(self, origin: str | None = None) -> list[Entry]:
-        """All entries, or those of one plugin, by kind and name."""
+        """All entries, or the entries of one plugin, by kind and name."""
         return [entry for key in self.offers(origin) if (entry := self.find(*key)) is not None]
 
 
 def _import_place(value: Any) -> Any:
-    """What ``"package.module:Name"`` names; anything else as it is."""
+    """The object at ``"package.module:Name"``. Any other value is returned unchanged."""
     if not isinstance(value, str):
         return value
     module, _, name = value.partition(":")
@@ -330,7 +329,7 @@ def _check(entry: Entry) -> None:
 
 
 def _is_settings(model: object) -> bool:
-    """Whether this is a subclass of ``Settings``, recognised by name: that is in a higher layer."""
+    """Whether this is a subclass of ``Settings``, recognised by name because that is in a higher layer."""
     return isinstance(model, type) and any(
         (base.__module__, base.__qualname__) == ("labseq.settings", "Settings") for base in model.__mro__
     )

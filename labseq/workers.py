@@ -1,4 +1,4 @@
-"""Workers: processes on this computer that carry out numbered tasks, whichever of them die on the way.
+"""Processes on this computer that carry out numbered tasks, even if some of the processes die.
 
 Each task goes to one worker. If that worker is lost, another one gets its tasks, and a new worker takes its
 place. A task that has ended several workers ends the work.
@@ -25,32 +25,32 @@ from labseq.errors import LabseqError
 from labseq.messages import error_text
 
 Do = Callable[[Any], Any]
-"""Carries out the task with this argument; returns its result."""
+"""Carries out the task with this argument and returns its result."""
 Make = Callable[[Any], Do]
-"""Prepares a worker from the recipe that all workers get; a function of a module, for it is sent by name."""
+"""Prepares a worker from the common recipe. Must be a module's function, because it is sent by name."""
 
 POLL_S: Final = 0.1
-"""Interval at which waiting for results is interrupted, in seconds: on Windows, Ctrl-C does not end it."""
+"""Interval at which waiting for results is interrupted, in seconds, as Ctrl-C does not end it on Windows."""
 QUEUED: Final = 2
 """Tasks that a worker is given in advance, so that it need not wait for the next one."""
 MAX_LOST: Final = 3
-"""Workers that a task may end before the work ends too: perhaps it needs more memory than there is."""
+"""Workers that a task may end before the work ends too, as it may need more memory than there is."""
 _START: Final = -1
-"""Stands for the preparation of a worker where the number of a task is expected."""
+"""Task number that means the preparation of a worker."""
 _FAREWELL_S: Final = 10.0
-"""Time for a worker to end, in seconds: a run makes its devices safe and records its end."""
+"""Time for a worker to end, in seconds, in which a run makes its devices safe and records its end."""
 
 
 class Workers(Protocol):
-    """Carries out tasks; used by one thread."""
+    """Carries out tasks. Used by one thread."""
 
     @property
     def n_workers(self) -> int:
-        """Number of workers now; at least 1."""
+        """Number of workers now, at least 1."""
         ...
 
     def prepare(self, make: Make, recipe: Any) -> None:
-        """Say what the tasks are; called once, before the first.
+        """Set how tasks are carried out. Called once, before the first task.
 
         Args:
             make: Prepares each worker.
@@ -63,12 +63,12 @@ class Workers(Protocol):
 
         Args:
             task: Its number, used once.
-            argument: The argument of ``Do``; small, and pickled.
+            argument: The argument of ``Do``, which is pickled, so keep it small.
         """
         ...
 
     def finished(self, timeout_s: float) -> list[tuple[int, Any]]:
-        """Wait until at least one task is done, or time is up; number and result of each that is.
+        """Wait until a task is done, or time is up. Returns number and result of each finished task.
 
         Raises:
             LabseqError: A worker cannot be prepared, a task failed, or it has ended :data:`MAX_LOST` workers.
@@ -76,12 +76,12 @@ class Workers(Protocol):
         ...
 
     def close(self) -> None:
-        """End all workers at once, whatever they are doing; legal at any time."""
+        """End all workers at once, whatever they are doing. Legal at any time."""
         ...
 
 
 def portable(error: Exception) -> LabseqError:
-    """An error as another process can receive it: as it is, or its text if it cannot be pickled."""
+    """An error that another process can receive, with only its text if it cannot be pickled."""
     if isinstance(error, LabseqError):
         with suppress(Exception):
             return pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
@@ -95,8 +95,8 @@ class _Worker:
     Attributes:
         connection: Takes tasks to it, and brings its answers.
         process: The process.
-        tasks: The tasks that it has been given: number -> argument.
-        at: The task that it has begun last, or its start; None if it waits.
+        tasks: Its tasks, number -> argument.
+        at: The task that it has begun last, or its start. None if it waits.
     """
 
     connection: Connection
@@ -116,7 +116,7 @@ class _Worker:
 
     def send(self, task: int, argument: Any) -> None:
         self.tasks[task] = argument
-        with suppress(OSError):  # it has died, which is found when its answers are read
+        with suppress(OSError):  # it has died, which is noticed when its answers are read
             self.connection.send((task, argument))
 
     def end(self) -> None:
@@ -133,7 +133,7 @@ class ProcessWorkers:
 
     Args:
         n_workers: Their number.
-        task_name: Names a task in messages: "run".
+        task_name: Name of a task in messages, for example "run".
 
     Attributes:
         n_workers: Their number.
@@ -193,7 +193,7 @@ class ProcessWorkers:
                 cause = "a start" if lost.at == _START else f"{self._task_name} {lost.at}"
                 raise LabseqError(
                     f"{MAX_LOST} worker processes have died of {cause} (exit code {lost.process.exitcode}); "
-                    "perhaps the memory was used up: try again with fewer --workers"
+                    "try fewer --workers, the memory may be used up"
                 )
         new = self._start()
         for task, argument in lost.tasks.items():
@@ -209,12 +209,12 @@ class ProcessWorkers:
 
 
 _Answer = tuple[Literal["ready", "begins", "done", "failed"], int, Any]
-"""What a worker sends: the event, its task, and the result or the error."""
+"""A worker's message, with the event, its task, and the result or the error."""
 
 
 def _serve(connection: Connection, make: Make, recipe: Any) -> None:
     """Carry out tasks in a worker process until the connection is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process, but the first one decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
     def send(*answer: *_Answer) -> None:
@@ -234,7 +234,7 @@ def _serve(connection: Connection, make: Make, recipe: Any) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process, as SIGTERM does, when the one that started it has died."""
+    """End this process, as SIGTERM does, when its parent has died."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -243,7 +243,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _ignored(number: int) -> Generator[None]:
-    """Ignore a signal for a while; other threads than the main one get none."""
+    """Ignore a signal within the block. Does nothing outside the main thread, which alone gets signals."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -256,7 +256,7 @@ def _ignored(number: int) -> Generator[None]:
 
 @contextmanager
 def _without_main() -> Generator[None]:
-    """Hide the program that is running: a process that is started would run it as well, to import from it."""
+    """Hide the running program, which a new process would otherwise run as well, to import from it."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:

@@ -20,7 +20,7 @@ from labseq.errors import ConfigError
             "needs certificates; 'labseq campaign keys FOLDER' makes them",
         ),
         ("tls://lab:8786", Path("nowhere"), "there is no ca.pem in nowhere"),
-        ("lab:8786", None, "this is not an address of a scheduler; expected tls://HOST:PORT"),
+        ("lab:8786", None, "this is not the address of a scheduler; expected tls://HOST:PORT"),
         ("tcp://127.0.0.1:9", None, "no scheduler answers"),
     ],
 )
