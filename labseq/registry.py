@@ -71,10 +71,10 @@ class Entry:
             place. None if it takes none.
         owner: The plugin that registered it.
         virtual_time: Whether it keeps to the session's clock only, so that a run need not wait in real time.
-        simulated: Settings that make a driver use its simulated device, for example ``{"card":
-            "simulated"}``. None if it has none. A dry run uses them. A driver that has them keeps to the
-            session's clock. A place may lead to a function that returns them, or that returns as text why the
-            device cannot be simulated on this computer.
+        simulated: Settings that make a driver use its simulated device, for example
+            ``{"card": "simulated"}``. None if it has none. A dry run uses them. A driver that has them keeps
+            to the session's clock. A place may lead to a function that returns them, or that returns as text
+            why the device cannot be simulated on this computer.
         no_simulator: Reason why the device cannot be simulated on this computer, or "" if it can.
         units: Units of the parameters of a fit, see :meth:`Registry.fit`.
     """

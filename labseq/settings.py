@@ -1,4 +1,4 @@
-"""Settings models of plugins, sequences and profiles: base class, quantities with units, common types."""
+"""Base class, quantities with units and common types of the settings of plugins, sequences and profiles."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ from labseq.messages import clean, shown
 from labseq.units import expected, parse_any, parse_quantity, unit_names
 
 FOLDER: Final = "folder"
-"""Key of pydantic's validation context: the folder of the file that the settings are in."""
+"""Key of pydantic's validation context for the folder of the file that holds the settings."""
 NEEDS_UNITS: Final = "needs_units"
-"""Key of pydantic's validation context: whether a quantity needs its unit, as in a file."""
+"""Key of pydantic's validation context, True if a quantity needs its unit, as in a file."""
 
 MAX_DURATION_S: Final = 30 * 86_400.0
-"""Longest duration of any setting: far more than any run, and every clock can count it."""
+"""Longest duration of any setting, far longer than any run, and within the range of every clock."""
 
 
 class Settings(BaseModel):
-    """Base of every settings model: immutable, refuses unknown keys, values in SI units.
+    """Base of every settings model, which is immutable, refuses unknown keys and holds SI values.
 
-    Subclass it for your plugin; give each field a description and, if possible, a default.
-    Quantities take text such as "45 ms"; in Python, also a number in SI units.
+    Subclass it for your plugin. Give each field a description and, if possible, a default. Quantities accept
+    text such as "45 ms", and in Python also a number in SI units.
 
     Example:
         >>> class Mine(Settings):
@@ -75,24 +75,24 @@ class Settings(BaseModel):
     )
 
     def identities(self) -> Sequence[str] | None:
-        """Of a driver: what only one process can use, known before it is opened: port, card, serial number.
+        """For drivers, names of what only one process can use, such as a port, a card or a serial number.
 
-        labseq locks it against other processes, and knows it again after a crash, whatever the profile.
-        Empty if there is nothing to lock; None (default) if unknown: the profile's path stands for it then.
+        labseq locks them before opening, and recognises them after a crash, even with another profile. Empty
+        if there is nothing to lock. If it is None (default), the profile's path is used instead.
         """
         return None
 
     def warnings(self) -> Iterable[tuple[Loc, str, str]]:
-        """Of a driver, for ``labseq check``: what is allowed but probably not intended.
+        """For drivers, values that are allowed but probably not intended, shown by ``labseq check``.
 
-        For each the keys from these settings to the place, what is there, and what would be right.
+        Each warning is the keys from these settings to the value, the problem, and the expected value.
         """
         return ()
 
     def algorithm_text(self) -> str:
-        """Of a planner, for ``labseq check``: the algorithm that these settings choose, in 60 characters.
+        """For planners, the algorithm that these settings select, for ``labseq check``, in 60 characters.
 
-        Empty (default) if the planner's name says it.
+        Empty (default) if the planner's name is enough.
         """
         return ""
 
@@ -102,7 +102,7 @@ class NoSettings(Settings):
 
 
 def key_without_unit(name: str) -> str:
-    """The key in a file for an attribute in SI: in a file the unit stands beside the value.
+    """The key in a file for an attribute in SI, without the unit, which a file gives with the value.
 
     Example:
         >>> key_without_unit("speed_m_s"), key_without_unit("distance_per_m")
@@ -121,7 +121,7 @@ IN_SI: Final = ConfigDict(
 )
 """Configuration of a domain type that is also a mapping of settings, as a dataclass of pydantic.
 
-Python constructs it with its attributes, whose names have their units; a file has :func:`key_without_unit`.
+Python code uses attribute names, which include the unit. A file uses :func:`key_without_unit`.
 """
 
 
@@ -131,10 +131,10 @@ def setting_error(
     """An error for a validator to raise, with its own wording and its place within the value.
 
     Args:
-        what: What is wrong.
-        expected: What would have been right.
-        hint: What to do.
-        at: Keys and indices from the value that is validated to the wrong one.
+        what: The problem.
+        expected: The expected value.
+        hint: The remedy.
+        at: Keys and indices from the validated value to the wrong part of it.
         key: Whether the key at that place is wrong, not its value.
     """
     context: dict[str, Any] = {"what": what, "expected": expected, "hint": hint, "at": at, "key": key}
@@ -143,7 +143,7 @@ def setting_error(
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """Converts text with a unit to SI; a number is in SI already, and comes from Python.
+    """Converts text with a unit to SI. A number comes from Python and is in SI already.
 
     Attributes:
         dimension: A key of :data:`labseq.units.UNITS`.
@@ -152,7 +152,7 @@ class Quantity:
     dimension: str
 
     def __call__(self, value: Any, info: ValidationInfo) -> Any:
-        """The value in SI; in a file only 0 needs no unit, unless the zero depends on the unit."""
+        """The value in SI. In a file only 0 needs no unit, unless the zero depends on the unit."""
         if isinstance(value, str):
             return parse_quantity(value, self.dimension)
         if value is None or isinstance(value, bool | list | tuple | dict):
@@ -175,7 +175,7 @@ class DefaultIfEmpty:
     default: Any
 
     def __call__(self, value: Any) -> Any:
-        """The default for None; any other value unchanged."""
+        """The default for None, any other value unchanged."""
         return self.default if value is None else value
 
 
@@ -194,16 +194,16 @@ SettingsType: TypeAlias = type[Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """One key of a settings model: what messages, reference pages, units and addresses need to know of it.
+    """One key of a settings model, described for messages, reference pages, units and addresses.
 
     Attributes:
         key: The key in a file.
         name: The attribute in Python.
-        annotation: Its type, with what annotates it.
-        default: The default; None for a key that must be given.
+        annotation: Its annotated type.
+        default: The default, or None for a key that must be given.
         is_required: Whether the key must be given.
-        description: What it is.
-        dimension: The dimension of its quantity, or of all quantities in its list; "" for none or several.
+        description: Its description.
+        dimension: The dimension of its quantity, or of all quantities in its list. "" for none or several.
         models: The models of the mapping that it holds, of the items of its list or of its named entries.
         is_by_name: Whether it holds a mapping of names that the user chooses.
     """
@@ -220,13 +220,13 @@ class Setting:
 
     @property
     def si_unit(self) -> str:
-        """The SI unit of its quantity; "" if it has none."""
+        """The SI unit of its quantity, or "" if it has none."""
         return "" if self.dimension in ("", "fraction") else unit_names(self.dimension)[0]
 
 
 @cache
 def settings_of(model: SettingsType | None) -> tuple[Setting, ...]:
-    """The settings of a model, in the order of its declaration; none for a plugin that takes none."""
+    """The settings of a model, in the order of declaration. Empty for a plugin without settings."""
     fields: Mapping[str, FieldInfo] = getattr(model, "__pydantic_fields__", {})
     settings = [_setting(name, field) for name, field in fields.items()]
     return tuple(setting for setting in settings if setting.key != _OWN_NAME)
@@ -257,20 +257,20 @@ def _parts(kind: Any) -> Iterator[Any]:
 
 
 def dimension_read_by(part: Any) -> str:
-    """The dimension of the quantity that a part of an annotation reads; "" for any other part."""
+    """The dimension of the quantity that a part of an annotation reads, or "" for any other part."""
     function = part.func if isinstance(part, BeforeValidator) else None
     return function.dimension if isinstance(function, Quantity) else ""
 
 
 def has_settings(kind: Any) -> TypeGuard[SettingsType]:
-    """Whether a type is a mapping of settings: a model, or a domain type with the configuration IN_SI."""
+    """Whether a type is a settings model, or a domain type with the configuration IN_SI."""
     return isinstance(kind, type) and hasattr(kind, "__pydantic_fields__")
 
 
 def settings_at(model: SettingsType | None, loc: Loc) -> Sequence[Setting]:
-    """The setting at a location below a model: several in a union, none at the top.
+    """The setting at a location below a model. There are several in a union, and none at the top.
 
-    Indices, and names that the user chooses, count as the list or mapping that they are in.
+    An index or a user's name leads to the setting that holds the list or mapping.
     """
     settings: Sequence[Setting] = ()
     models: Sequence[SettingsType | None] = [model]
@@ -282,13 +282,13 @@ def settings_at(model: SettingsType | None, loc: Loc) -> Sequence[Setting]:
 
 
 def models_at(model: SettingsType, loc: Loc) -> list[SettingsType]:
-    """The settings models of a location below a model: several in a union."""
+    """The settings models at a location below a model. There are several in a union."""
     settings = settings_at(model, loc)
     return [inner for setting in settings for inner in setting.models] if settings else [model]
 
 
 def si_unit_at(model: SettingsType | None, loc: Loc) -> str:
-    """SI unit of the setting at a location in a settings model; "" if there is no setting or no unit.
+    """SI unit of the setting at a location in a settings model, or "" if there is no setting or no unit.
 
     Example:
         >>> class Mine(Settings):
@@ -306,7 +306,7 @@ def _not_too_long(duration_s: float) -> float:
 
 
 def path_beside(folder: Path, path: str) -> Path:
-    """A path that a file in ``folder`` names; ``~`` is the user's home."""
+    """A path in a file in ``folder``, relative to that folder. ``~`` is the user's home."""
     try:
         return folder / Path(path).expanduser()
     except RuntimeError:  # "~nobody"
@@ -321,29 +321,29 @@ def _beside_its_file(path: Path, info: ValidationInfo) -> Path:
 Text: TypeAlias = Annotated[str, Field(min_length=1)]
 """Any text except the empty one."""
 FilePath: TypeAlias = Annotated[Path, AfterValidator(_beside_its_file)]
-"""A file, relative to the sequence or profile that names it; in Python, to the working folder."""
+"""A file, relative to the sequence or profile that names it, or in Python to the working folder."""
 Duration: TypeAlias = Annotated[float, _quantity("time"), Field(ge=0), AfterValidator(_not_too_long)]
-"""Seconds, 0 to :data:`MAX_DURATION_S`; "45 ms"."""
+"""Seconds, from 0 to :data:`MAX_DURATION_S`, as "45 ms"."""
 PositiveDuration: TypeAlias = Annotated[
     float, _quantity("time"), Field(gt=0), AfterValidator(_not_too_long)
 ]  # not built on Duration, whose limit would be named for values below 0
-"""Seconds, more than 0, to :data:`MAX_DURATION_S`; "45 ms"."""
+"""Seconds, more than 0, at most :data:`MAX_DURATION_S`, as "45 ms"."""
 Length: TypeAlias = Annotated[float, _quantity("length")]
-"""Metres; "4.49 um"."""
+"""Metres, as "4.49 um"."""
 Frequency: TypeAlias = Annotated[float, _quantity("frequency")]
-"""Hertz; "80 MHz"."""
+"""Hertz, as "80 MHz"."""
 Speed: TypeAlias = Annotated[float, _quantity("speed"), Field(gt=0)]
-"""Metres per second, more than 0; "130 um/ms"."""
+"""Metres per second, more than 0, as "130 um/ms"."""
 Voltage: TypeAlias = Annotated[float, _quantity("voltage")]
-"""Volts; "200 mV"."""
+"""Volts, as "200 mV"."""
 Power: TypeAlias = Annotated[float, _quantity("power")]
-"""Watts; "10 mW"."""
+"""Watts, as "10 mW"."""
 Temperature: TypeAlias = Annotated[float, _quantity("temperature")]
-"""Kelvins; "300 uK"."""
+"""Kelvins, as "300 uK"."""
 Angle: TypeAlias = Annotated[float, _quantity("angle")]
-"""Radians; "60 deg"."""
+"""Radians, as "60 deg"."""
 Fraction: TypeAlias = Annotated[float, _quantity("fraction"), Field(ge=0, le=1)]
-"""0 to 1; "75 %"."""
+"""0 to 1, as "75 %"."""
 
 
 class Choice(Settings):
@@ -362,12 +362,12 @@ class Choice(Settings):
 
     @property
     def loc(self) -> Loc:
-        """Where its mapping is in the document."""
+        """Location of its mapping in the document."""
         return self._loc
 
     @property
     def core_keys(self) -> frozenset[str]:
-        """Keys of the mapping that labseq reads itself; all others are the plugin's settings."""
+        """Keys of the mapping that labseq reads itself. All others are the plugin's settings."""
         return frozenset(setting.key for setting in settings_of(type(self)))
 
     def placed(self, *loc: str | int) -> Self:
@@ -381,12 +381,12 @@ class Choice(Settings):
     def _refuse_bare_name(cls, value: Any) -> Any:
         if isinstance(value, str):
             name = clean(value)
-            raise setting_error(f"there is just '{name}' here", "a mapping", f"write '{{{cls.key}: {name}}}'")
+            raise setting_error(f"there is only '{name}' here", "a mapping", f"write '{{{cls.key}: {name}}}'")
         return value
 
 
 class PatternChoice(Choice):
-    """A target pattern: ``{pattern: compact, rows: 15, cols: 15}``."""
+    """A target pattern, as ``{pattern: compact, rows: 15, cols: 15}``."""
 
     key: ClassVar[str] = "pattern"
     use: Text = Field(alias="pattern", description="the name of a target pattern")
@@ -407,9 +407,9 @@ def with_settings_of(spec: SettingsType) -> Callable[[type[_C]], type[_C]]:
 
 
 _OWN_NAME: Final = ""
-"""The key that :data:`named_by_key` adds; no file has it."""
+"""The key that :data:`named_by_key` adds. No file contains it."""
 OwnName: TypeAlias = Annotated[SkipJsonSchema[str], Field(validation_alias=_OWN_NAME, exclude=True)]
-"""The name of one of several mappings with names of their own: in a file, the key that it stands under."""
+"""The name that a user gives to one of several mappings, which in a file is the key of the mapping."""
 
 
 def _named_by_key(mappings: Any) -> Any:
@@ -423,7 +423,7 @@ def _named_by_key(mappings: Any) -> Any:
 
 
 named_by_key: Final = BeforeValidator(_named_by_key)
-"""For a mapping of names to mappings of settings: each has its name as its :data:`OwnName`."""
+"""Validator for a mapping of names to settings, which puts each name into the settings' :data:`OwnName`."""
 
 
 def _placed_by_field(choice: _C, info: ValidationInfo) -> _C:
@@ -431,7 +431,7 @@ def _placed_by_field(choice: _C, info: ValidationInfo) -> _C:
 
 
 placed_by_field: Final = AfterValidator(_placed_by_field)
-"""For a field that is a :class:`Choice`: its location is the field's name."""
+"""Validator for a field that is a :class:`Choice`, whose location is the field's name."""
 
 
 FORMAT: Final = 1
@@ -459,7 +459,7 @@ def _is_name(name: str) -> str:
 
 
 def si_of(value: Any) -> Any:
-    """The value of a variable, SI, from what is written."""
+    """The value of a variable in SI, from a number or a quantity as text."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return value
     try:
@@ -478,7 +478,7 @@ def _check_names(variables: dict[str, int | float]) -> dict[str, int | float]:
 
 
 FormatVersion: TypeAlias = Annotated[Literal[1], BeforeValidator(_is_version)]
-"""1."""
+"""Version of the file format, which must be 1."""
 Name: TypeAlias = Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_is_name)]
 """A name that can be part of the name of a folder."""
 Folders: TypeAlias = Annotated[list[Text], empty_is([])]

@@ -1,4 +1,4 @@
-"""Reads the text files that users write: limited size, UTF-8, a hint at the file that was meant."""
+"""Reads users' text files of limited size in UTF-8, with a hint if a file name is misspelt."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from labseq.files import is_there
 from labseq.messages import clean, closest, visible
 
 MAX_BYTES: Final = 1 << 18
-"""Largest YAML file, in bytes; reading it takes a quarter of a second."""
+"""Largest YAML file, in bytes. Reading it takes a quarter of a second."""
 
 YAML_SUFFIXES: Final = (".yaml", ".yml")
 
@@ -30,7 +30,7 @@ def read_bytes(
 
     Args:
         path: The file.
-        expected: What the file should be, for the message if it is a folder or a pipe.
+        expected: Kind of file, for the message if it is a folder or a pipe.
         suffixes: If the file is missing, the hint names a similar file with one of these suffixes.
         max_bytes: Largest size.
 
@@ -62,7 +62,7 @@ def decode(data: bytes, name: str) -> str:
     """Decode UTF-8, without the byte order mark.
 
     Raises:
-        ConfigError: Not UTF-8; with the place of the first wrong byte.
+        ConfigError: Not UTF-8. The error has the place of the first wrong byte.
     """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, *_UTF32)):
         encoding = "UTF-32" if data.startswith(_UTF32) else "UTF-16"
@@ -83,13 +83,13 @@ def decode(data: bytes, name: str) -> str:
 
 
 def line_and_column(text: str, index: int) -> tuple[int, int]:
-    """Line and column, from 1, of a character of a text; lines end with LF, CR or CR LF."""
+    """Line and column, from 1, of a character of a text whose lines end with LF, CR or CR LF."""
     lines = text[:index].replace("\r\n", "\n").replace("\r", "\n").split("\n")
     return len(lines), len(lines[-1]) + 1
 
 
 def files_in(folder: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> list[str]:
-    """Names of the files in a folder with one of the suffixes, sorted; none if it cannot be read."""
+    """Names of the files in a folder with one of the suffixes, sorted. Empty if it cannot be read."""
     try:
         return sorted(path.name for path in folder.iterdir() if path.suffix in suffixes)
     except (OSError, ValueError):
@@ -105,7 +105,7 @@ def alike_file(path: Path, suffixes: Collection[str] = YAML_SUFFIXES) -> str:
 
 
 def is_file(path: Path) -> bool:
-    """Whether this is a file; False if that cannot be found out."""
+    """Whether this is a file. False if that cannot be found out."""
     try:
         return path.is_file()
     except OSError:
@@ -113,7 +113,7 @@ def is_file(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether this is a folder; False if that cannot be found out."""
+    """Whether this is a folder. False if that cannot be found out."""
     try:
         return path.is_dir()
     except OSError:
@@ -121,7 +121,7 @@ def is_folder(path: Path) -> bool:
 
 
 def something_else(path: Path) -> str:
-    """The kind of thing at a path, "this is a folder"; "" for a file, and if nothing is there."""
+    """Message if a path is not a file, as "this is a folder". "" for a file, or if nothing is there."""
     try:
         return _other_kind(path.stat().st_mode)
     except (OSError, ValueError):
@@ -129,12 +129,12 @@ def something_else(path: Path) -> str:
 
 
 def check_output(path: Path, kind: str, ending: str) -> None:
-    """Check name and folder of a file before the work that it is for.
+    """Check name and folder of an output file before the work that produces it.
 
     Args:
         path: The file.
-        kind: "an NPZ file".
-        ending: ".npz".
+        kind: For example "an NPZ file".
+        ending: For example ".npz".
 
     Raises:
         ConfigError: It has another ending, its folder does not exist, or the path is not an ordinary file.
@@ -144,7 +144,7 @@ def check_output(path: Path, kind: str, ending: str) -> None:
         raise ConfigError(Problem(f"this is not the name of {kind}", name, expected=expected))
     if not is_folder(path.parent):
         folder = visible(str(path.parent))
-        raise ConfigError(Problem("there is no such folder", folder, expected="one that exists"))
+        raise ConfigError(Problem("there is no such folder", folder, expected="an existing folder"))
     if message := something_else(path):
         raise ConfigError(Problem(message, name, expected=expected))
     try:

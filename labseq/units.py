@@ -1,7 +1,7 @@
 """Quantities with units, converted to plain SI numbers.
 
-Only YAML files and displays use units such as "45 ms"; all values inside labseq and on disk
-are SI. In Python a plain number is in SI; in a file it needs its unit.
+Only YAML files and displays use units such as "45 ms". All values inside labseq and on disk are SI. In Python
+a plain number is in SI. In a file it needs its unit.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ EXAMPLES: Final[Mapping[str, str]] = MappingProxyType(
 
 
 ZERO_CELSIUS_K: Final = 273.15
-"""0 degC in kelvins; degC is the only unit with a different zero."""
+"""0 degC in kelvins. degC is the only unit with a different zero."""
 
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(\S.*?)?\s*\Z")
 
@@ -67,7 +67,7 @@ def parse_quantity(text: str, dimension: str) -> float:
     """Convert a quantity such as "45 ms" to SI.
 
     Args:
-        text: A number and a unit; the space between them may be left out.
+        text: A number and a unit. The space between them may be left out.
         dimension: A key of :data:`UNITS`.
 
     Returns:
@@ -105,7 +105,7 @@ def parse_quantity(text: str, dimension: str) -> float:
 
 
 def split_quantity(text: str) -> tuple[float, str]:
-    """Split a quantity into its number and unit as written; nan and "" for other text.
+    """Split a quantity into its number and unit as written. nan and "" for other text.
 
     Example:
         >>> split_quantity("45 ms")
@@ -119,7 +119,7 @@ def parse_any(text: str) -> tuple[float, str]:
     """Convert a quantity of any dimension to SI.
 
     Returns:
-        The value, and its dimension; "fraction" for percents.
+        The value, and its dimension ("fraction" for percents).
 
     Raises:
         ValueError: The text is not a number with a unit.
@@ -136,7 +136,7 @@ def parse_any(text: str) -> tuple[float, str]:
 
 
 def dimension_of(unit: str) -> str:
-    """The dimension of a unit; "" for an unknown unit.
+    """The dimension of a unit, or "" for an unknown unit.
 
     Example:
         >>> dimension_of("um/ms")
@@ -146,7 +146,7 @@ def dimension_of(unit: str) -> str:
 
 
 def si_unit_of(text: str) -> str:
-    """The SI unit of a quantity of any dimension; "" for a fraction and for other text.
+    """The SI unit of a quantity of any dimension, or "" for a fraction and for other text.
 
     Example:
         >>> si_unit_of("60 ms"), si_unit_of("130 um/ms"), si_unit_of("75 %"), si_unit_of("7")
@@ -160,7 +160,7 @@ def si_unit_of(text: str) -> str:
 
 
 def factor_of(unit: str) -> float:
-    """Factor of a unit of any dimension to SI; 1 for "" and for an unknown unit."""
+    """Factor from a unit of any dimension to SI. 1 for "" and for an unknown unit."""
     return next((units[unit] for units in UNITS.values() if unit and unit in units), 1.0)
 
 
@@ -177,11 +177,11 @@ def written(value: float, unit: str) -> str:
 
 
 def with_error(value: float, error: float) -> str:
-    """A value with the error of its last digit in brackets; "-" for nan.
+    """A value with the error of its last digit in brackets, or "-" for nan.
 
     Args:
         value: In any unit.
-        error: Its standard error in the same unit; nan if unknown.
+        error: Its standard error in the same unit. nan if unknown.
 
     Example:
         >>> with_error(29.6142, 0.031), with_error(5988.0, 12.0), with_error(1.0, 0.0)
@@ -206,7 +206,7 @@ def with_error(value: float, error: float) -> str:
 
 
 def scaled(number: float, factor: float) -> float:
-    """Multiply without rounding errors for powers of ten: 4.49 um is 4.49e-06, not 4.4899...e-06.
+    """Multiply without rounding errors for powers of ten, so that 4.49 um is 4.49e-06, not 4.4899...e-06.
 
     Example:
         >>> scaled(4.49, 1e-6)

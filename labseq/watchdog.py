@@ -1,4 +1,4 @@
-"""The run's side of the watchdog: starts its process, tells it the devices, and sends the heartbeat."""
+"""The run's side of the watchdog, which starts its process, tells it the devices, and sends heartbeats."""
 
 from __future__ import annotations
 
@@ -28,15 +28,16 @@ WATCHDOG_LOG: Final = "watchdog.jsonl"
 BEAT_S: Final = 0.05
 """Interval between two heartbeats."""
 STUCK_S: Final = 10.0
-"""A run counts as dead if its thread of shots has neither waited nor made progress for this long."""
+"""A run counts as dead if the thread that takes its shots has neither waited nor made progress for this
+long."""
 ANSWER_S: Final = 10.0
-"""How long a run waits for an answer of the watchdog, which may have to load a vendor's library."""
+"""How long a run waits for an answer from the watchdog, which may have to load a vendor's library."""
 END_S: Final = 1.0
 """How long a run waits for the end of a watchdog that has nothing left to do."""
 
 
 def watchdog_lines(run_dir: Path) -> list[str]:
-    """What the watchdog of a run did, a line for each device; damaged lines of its log are left out."""
+    """The actions of a run's watchdog, one line for each device, without damaged lines of its log."""
     lines: list[str] = []
     with suppress(RecordingError):
         for row in read_lines(run_dir / WATCHDOG_LOG)[0]:
@@ -49,15 +50,15 @@ def watchdog_lines(run_dir: Path) -> list[str]:
 class Watchdog:
     """Starts the watchdog, reports the devices to it, and sends the heartbeat.
 
-    A watchdog that dies, or stands still, is replaced, as often as needed. If that is not possible, ``lost``
-    is called; where it cannot be started at all, there is a warning. Nothing here raises.
+    A watchdog that dies or hangs is replaced, as often as needed. If that is not possible, ``lost`` is
+    called. If it cannot be started at all, there is a warning. Nothing here raises.
 
     Args:
-        run_name: What the watchdog calls the run in its messages.
-        log: File to which it adds a line for each device that it switches off; None for none.
-        pulse: Progress of the thread that adds the first device; without any, the run counts as dead to the
-            watchdog. None if there is no such thread.
-        lost: Called with the reason if no watchdog is left; it ends the run.
+        run_name: Name of the run in the watchdog's messages.
+        log: File to which it adds a line for each device that it switches off. None for none.
+        pulse: Progress of the thread that adds the first device. Without progress, the run counts as dead.
+            None if there is no such thread.
+        lost: Called with the reason if no watchdog is left. It ends the run.
         may_end: Whether it may end this process to switch off a device that it cannot switch off otherwise.
     """
 
@@ -86,7 +87,7 @@ class Watchdog:
         self._n_awaited = 0
 
     def add(self, name: str, order: int, script: Path, arguments: object) -> None:
-        """Have it switch a device off after the death of this process; the first one starts it.
+        """Have it switch a device off if this process dies. The first device starts the watchdog.
 
         Args:
             name: The device.
@@ -103,17 +104,17 @@ class Watchdog:
         device = {"device": name, "order": order, "script": str(script), "arguments": arguments}
         with self._sending:
             self._devices[name] = device
-        self._tell(device)  # without the lock: heartbeats go on while it loads libraries
+        self._tell(device)  # without the lock, so that heartbeats go on while it loads libraries
 
     def forget(self, names: Iterable[str]) -> None:
-        """Leave devices alone from now on: they are safe and closed."""
+        """Leave devices alone from now on, because they are safe and closed."""
         with self._sending:
             for name in names:
                 if self._devices.pop(name, None) is not None:
                     self._send({"forget": name})
 
     def end(self) -> None:
-        """End it; it then switches off the devices that it was not asked to forget. Legal at any time."""
+        """End the watchdog, which first switches off the devices that are left. Legal at any time."""
         self._ended.set()
         self._wake.set()
         with self._sending:
@@ -129,12 +130,12 @@ class Watchdog:
                     return
                 try:
                     process.wait(END_S)
-                except Exception:  # noqa: BLE001 - it stands still
+                except Exception:  # noqa: BLE001 - it hangs
                     process.kill()
                     process.wait()
 
     def notes(self) -> list[str]:
-        """What went wrong since the last call, for the user."""
+        """Messages for the user about failures since the last call."""
         notes: list[str] = []
         with suppress(queue.Empty):
             while True:
@@ -142,7 +143,7 @@ class Watchdog:
         return notes
 
     def _launch(self) -> bool:
-        """Start the process, and send it the devices that are open; returns whether it answers."""
+        """Start the process, and send it the open devices. Returns whether it answers."""
         # only a run with real hardware needs these
         import subprocess
 
@@ -159,7 +160,7 @@ class Watchdog:
                 bufsize=0,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                start_new_session=True,  # Ctrl-C and a lost terminal are not for it
+                start_new_session=True,  # so that Ctrl-C and a lost terminal do not end it
                 creationflags=flags,
             )
             threading.Thread(target=self._hear, args=[self._process, self._answers], daemon=True).start()
@@ -186,7 +187,7 @@ class Watchdog:
                 self._wake.set()
 
     def _tell(self, message: dict[str, Any]) -> bool:
-        """Send a message that is answered, and note the failure that it names; False without answer."""
+        """Send a message, wait for the answer and note the failure in it. False without an answer."""
         self._n_awaited += 1
         answer = b""
         try:
@@ -210,7 +211,7 @@ class Watchdog:
         answers, hanging, deadline_s = self._answers, self._hanging, time.monotonic() + ANSWER_S
         while True:
             if self._pulse is not None:
-                self._pulse.beat()  # it may be the thread that takes the shots that waits here
+                self._pulse.beat()  # the thread that takes the shots may be waiting here
             try:
                 return answers.get(timeout=BEAT_S)
             except queue.Empty:
@@ -218,7 +219,7 @@ class Watchdog:
                     raise
 
     def _send(self, message: dict[str, Any] | None) -> bool:
-        """Send a message, or a heartbeat; returns whether it could be sent."""
+        """Send a message or a heartbeat. Returns whether it could be sent."""
         line = b"\n" if message is None else json.dumps(message).encode() + b"\n"
         with self._sending, suppress(OSError, ValueError):
             if self._process is not None and self._process.stdin is not None:
@@ -227,9 +228,9 @@ class Watchdog:
         return False
 
     def _beat(self) -> None:
-        """Send heartbeats; have the run ended if it makes no progress; replace a watchdog that is gone.
+        """Send heartbeats, report a run without progress, and replace a watchdog that is gone.
 
-        While this thread does not run either, the computer stands still: of that time little counts.
+        If this thread does not run either, the whole computer stops, so little of that time counts.
         """
         n_failed, looked_s = 0, time.monotonic()
         while not self._ended.is_set():
@@ -244,15 +245,15 @@ class Watchdog:
                 continue
             if self._replace("does not answer" if is_silent else "has ended"):
                 n_failed = 0
-            elif (n_failed := n_failed + 1) == 3:  # this many in a row have not come to life
-                self._note("cannot be started again; the run ends")
+            elif (n_failed := n_failed + 1) == 3:  # this many in a row have not started
+                self._note("cannot be started again, so the run ends")
                 with self._sending:
                     self._kill()  # without a heartbeat it would end the run before the devices are safe
-                self._lost("no watchdog is left that would switch the outputs off")
+                self._lost("no watchdog is left to switch the outputs off")
                 return
 
     def _replace(self, why: str) -> bool:
-        """Start another watchdog in place of one that is gone; returns whether it answers."""
+        """Replace a watchdog that is gone. Returns whether the new one answers."""
         with self._sending:
             if self._ended.is_set():
                 return True

@@ -1,10 +1,10 @@
-"""The watchdog: a small process that switches the outputs off when the run that uses them dies or hangs.
+"""The watchdog, a small process that switches the outputs off when the run that uses them dies or hangs.
 
-It needs the standard library alone, and psutil on Windows: it must start fast, stay small, and work when
-nothing else does. The run's side, :mod:`labseq.watchdog`, passes on how each device is switched off
-(``Emergency``), and sends a heartbeat. Messages are lines of JSON on standard input; an empty line is a
-heartbeat; the end of the input without ``end`` is the death of the run. It answers in the same way on
-standard output, so that the run notices when the watchdog dies or hangs, and starts another one.
+It needs only the standard library (and psutil on Windows), because it must start fast, stay small, and work
+when nothing else does. The run's side, :mod:`labseq.watchdog`, passes on how each device is switched off
+(``Emergency``), and sends a heartbeat. Messages are lines of JSON on standard input. An empty line is a
+heartbeat. The end of the input without ``end`` means that the run has died. The watchdog answers in the same
+way on standard output, so that the run notices when it dies or hangs, and starts another one.
 """
 
 from __future__ import annotations
@@ -29,19 +29,20 @@ LOOK_S: Final = 0.05
 WAITS_S: Final = 10.0
 """How long the heartbeat may be missing while a thread waits for a disk, swapped memory or a processor."""
 TERM_S: Final = 0.1
-"""How long a run that hangs may take to end after SIGTERM; then comes SIGKILL."""
+"""How long a run that hangs may take to end after SIGTERM, before SIGKILL."""
 NEXT_S: Final = 0.05
-"""How long the switching off of a device delays that of the next one."""
+"""How long switching off one device may delay the next."""
 TRY_AGAIN_S: Final = 5.0
-"""How long switching off is tried again if it fails: a dying process may hold the device a little longer."""
+"""How long switching off is retried if it fails, since a dying process may hold the device a little
+longer."""
 HANGS_S: Final = 1.0
-"""How long after that it counts as hanging."""
+"""Further time after which switching off counts as hanging."""
 MAX_TEXT: Final = 500
 """Length at which texts of errors are cut."""
 
 
 def main() -> None:
-    """Run the watchdog: lines on standard input, one answer for each device on standard output."""
+    """Run the watchdog, with messages on standard input and an answer for each device on standard output."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK", "SIGPIPE"):
         if (number := getattr(signal, name, None)) is not None:
             signal.signal(number, signal.SIG_IGN)
@@ -51,7 +52,7 @@ def main() -> None:
 
 
 def _take_precedence() -> None:
-    """Real-time priority, memory that is not swapped out, and last to be ended for want of it; if allowed."""
+    """Get real-time priority, locked memory and the last place when memory runs out, where allowed."""
     with suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     with suppress(OSError):
@@ -86,7 +87,7 @@ class _Device:
             try:
                 done = self._off(**self._arguments)
                 return report(str(done), "")
-            except BaseException as error:  # noqa: BLE001 - whatever it raises, it is tried again
+            except BaseException as error:  # noqa: BLE001 - after any error it is tried again
                 if time.monotonic() > deadline:
                     return report("", _format_error(error))
             time.sleep(NEXT_S)
@@ -130,7 +131,7 @@ class _Process:
             if line.strip() and not self._obey(json.loads(line)):
                 return None
             now_s = time.monotonic()
-            if now_s - looked_s > 2 * LOOK_S:  # the computer stood still, and so did the run
+            if now_s - looked_s > 2 * LOOK_S:  # the whole computer stopped, including the run
                 self._beat_s += now_s - looked_s - LOOK_S
             looked_s = now_s
             if self._hangs(now_s - self._beat_s):
@@ -144,13 +145,13 @@ class _Process:
         self._lines.put(None)
 
     def _is_orphan(self) -> bool:
-        """Whether the run is gone although another process still holds its end of the pipe."""
+        """Whether the run is gone, even if another process still holds its end of the pipe."""
         if os.name == "nt":  # where the id of the parent stays, and may be given to another process
             return self._run_process is not None and not self._run_process.is_running()
         return os.getppid() != self._run_pid
 
     def _obey(self, order: dict[str, Any]) -> bool:
-        """Carry out a message; returns whether to go on."""
+        """Carry out a message. Returns whether to go on."""
         if "run" in order:
             self._run_name, self._log = order["run"], Path(order["log"]) if order["log"] else None
             self._may_end = order["may_end"]
@@ -158,7 +159,7 @@ class _Process:
             if os.name == "nt":
                 import psutil
 
-                with suppress(psutil.NoSuchProcess):  # it has died already; the end of the input says so
+                with suppress(psutil.NoSuchProcess):  # it has died already, so the input ends
                     self._run_process = psutil.Process(self._run_pid)
             self._answer("")
         elif "device" in order:
@@ -175,7 +176,7 @@ class _Process:
             self._end_run()
             self._switch_off(f"made no progress for {order['stuck']:.0f} s", time.monotonic())
             return False
-        else:  # the end; devices that are left could not be made safe
+        else:  # the end, and the remaining devices could not be made safe
             self._switch_off("could not make its devices safe", time.monotonic())
             return False
         return True
@@ -199,16 +200,16 @@ class _Process:
                 time.sleep(0.002)
 
     def _switch_off(self, cause: str, since_s: float) -> None:
-        """Switch every device off; for those that it cannot, end the process that may hold their ports."""
+        """Switch every device off. If that fails, end the run, which may hold the ports, and try again."""
         failed = self._try_all(self._devices, cause, since_s)
         if failed and self._may_end and not self._is_orphan():
             self._end_run()
             self._try_all(failed, cause, since_s)
 
     def _try_all(self, devices: dict[str, _Device], cause: str, since_s: float) -> dict[str, _Device]:
-        """Switch devices off in the order of the safe state, none waiting long for another.
+        """Switch devices off in the order of the safe state, without long waits for each other.
 
-        Returns those that are not off.
+        Returns the devices that are not off.
         """
         failed, threads = dict(devices), dict[str, threading.Thread]()
         for name, device in sorted(devices.items(), key=lambda item: item[1].order):
@@ -229,7 +230,7 @@ class _Process:
         return failed
 
     def _report(self, cause: str, name: str, done: str, failure: str, after_s: float) -> None:
-        """Write down what was done, first to the log, then to the terminal."""
+        """Write the outcome first to the log, then to the terminal."""
         row = {
             "t_utc": datetime.now(UTC).isoformat(timespec="milliseconds"),  # noqa: TID251 - no other module here
             "cause": cause,
@@ -255,7 +256,7 @@ class Hanging:
 
     Args:
         pid: The process.
-        hung_s: How long the heartbeat of a working process may be missing; no call of a run holds the
+        hung_s: How long the heartbeat of a working process may be missing. No call of a run holds the
             interpreter nearly as long as the default.
     """
 
@@ -265,7 +266,7 @@ class Hanging:
         self._since: dict[str, float] | None = None
 
     def __call__(self, silent_s: float) -> bool:
-        """Whether it hangs; to be asked again and again, also while it does not."""
+        """Whether it hangs. Must be called regularly, also while it does not hang."""
         if silent_s < self._hung_s / 4:
             self._since = None
             return False
@@ -304,7 +305,7 @@ def _threads(pid: int) -> tuple[str, dict[str, float]]:
 
 
 def _format_error(error: BaseException) -> str:
-    """An exception as one short line, even if its own text cannot be had."""
+    """An exception as one short line, even if it has no readable text."""
     try:
         text = " ".join(str(error)[: 2 * MAX_TEXT].split())
     except BaseException:  # noqa: BLE001 - a broken __str__

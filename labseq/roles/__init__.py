@@ -1,16 +1,14 @@
 """The roles that plugins implement, and the objects that labseq passes to them.
 
-Roles are synchronous. A constructor does no I/O; ``open()`` does. Hardware roles
-share ``open``, ``close``, ``safe_state`` (legal in any state, also before
-``open``, and any number of times) and ``describe``. Optional abilities are methods
-of the role's base class that do nothing by default, so the core calls them without asking.
-The few Protocols that remain (``ChoosesPlanner``, ``LeaderLink``, ``NeedsWarmUp``, ``ReportsSignals``,
-``ReceivesOutput``) change what the core does where a plugin has them. :data:`ROLES` lists the roles;
-what a factory makes is checked against it once.
+Roles are synchronous. Only ``open()`` does I/O, not a constructor. Hardware roles share ``open``, ``close``,
+``safe_state`` (legal in any state, also before ``open``, and any number of times) and ``describe``. Optional
+abilities are methods of the role's base class that do nothing by default, so the core calls them without
+asking. The few Protocols that remain (``ChoosesPlanner``, ``LeaderLink``, ``NeedsWarmUp``,
+``ReportsSignals``, ``ReceivesOutput``) change the core's behaviour for plugins that implement them.
+:data:`ROLES` lists the roles. Each object from a factory is checked against it once.
 
-Failures: a device raises ``DeviceError`` (or ``DeviceTimeoutError``),
-``LimitError`` before anything moves when the request is out of range, and
-``TransientError`` when repeating the shot may help.
+If a device fails, it raises ``DeviceError`` (or ``DeviceTimeoutError``). It raises ``LimitError`` before
+anything moves if the request is out of range, and ``TransientError`` if repeating the shot may help.
 """
 
 from labseq.roles.deciding import (

@@ -1,7 +1,7 @@
-"""The roles that decide, and those that analyse the result: planner, detector, scanner, analysis.
+"""The roles that decide or analyse the result, which are planner, detector, scanner and analysis.
 
-All are pure functions of their inputs. A class needs only the methods of its role; it need not be
-derived from the role's class.
+All are pure functions of their inputs. A class needs only the methods of its role. It need not be derived
+from the role's class.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from labseq.model import (
 
 
 class Planner(Protocol):
-    """Decides the moves. Pure: deterministic, no I/O, the input left unchanged."""
+    """Decides the moves. It is deterministic, does no I/O and leaves the input unchanged."""
 
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
         """Plan the moves that fill the target.
@@ -33,8 +33,7 @@ class Planner(Protocol):
         With too few atoms it fills as many sites as possible, from the centre of the target.
 
         Args:
-            occupancy: bool (n_rows, n_cols), as detected; of any memory layout, and
-                perhaps read-only.
+            occupancy: bool (n_rows, n_cols), as detected. It may have any memory layout, and be read-only.
             target: The target pattern.
         """
         ...
@@ -43,7 +42,7 @@ class Planner(Protocol):
 Detection: TypeAlias = (
     tuple[Occupancy, NDArray[np.float32]] | tuple[Occupancy, NDArray[np.float32], NDArray[np.float64]]
 )
-"""Occupancy and confidence of each site; and, if the detector has one, the signal that it was decided by."""
+"""Occupancy and confidence of each site, and the signal behind the decision if the detector has one."""
 
 
 class Detector(Protocol):
@@ -63,21 +62,21 @@ class Detector(Protocol):
 class Scanner(Protocol):
     """Chooses the points of an adaptive scan, one after another.
 
-    Pure: the choice depends only on its settings, the space (its seed included) and the points visited
-    so far; it does no I/O. So a resumed run continues like an uninterrupted one. It may cache results
-    as long as they change no choice.
+    The choice depends only on its settings, the space (including its seed) and the points visited so far. It
+    does no I/O. So a resumed run continues like an uninterrupted run. It may cache results as long as they
+    change no choice.
     """
 
     def next_point(self, visited: Sequence[VisitedPoint]) -> Mapping[str, float] | None:
         """Choose the next point.
 
         Args:
-            visited: The points so far with their scores, in order; none at the first call. A point
-                may occur more than once.
+            visited: The points so far with their scores, in order. Empty at the first call. A point may occur
+                more than once.
 
         Returns:
             A value for each address, SI, within its range (:meth:`labseq.plugin.ScanRange.at` gives such
-            values); or None to end the run.
+            values), or None to end the run.
         """
         ...
 
@@ -102,7 +101,7 @@ class RecordedShot(Protocol):
 
     @property
     def filling_fraction(self) -> float:
-        """Filling of the target on its last ``image`` step; nan without one."""
+        """Filling of the target on its last ``image`` step, or nan if it has none."""
         ...
 
     @property
@@ -142,26 +141,26 @@ class RecordedShot(Protocol):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """Settings of this shot that differ from the files: address -> value; scanned ones in SI."""
+        """Settings of this shot that differ from the files, address -> value. Scanned values are in SI."""
         ...
 
 
 class Analysis(Protocol):
     """Computes results from each shot, in a separate process next to the run.
 
-    It may have an attribute ``results``, the names of its results that are single values: ``labseq check``
-    then refuses a check or an adaptive scan that needs another one.
+    It may have an attribute ``results``, the names of its results that are single values. ``labseq check``
+    then refuses a check or an adaptive scan that needs any other result.
     """
 
     def shot(self, shot: RecordedShot) -> Mapping[str, Any]:
         """Analyse a shot.
 
         Args:
-            shot: The shot, complete and on disk; shots come in the order they were taken.
+            shot: The shot, complete and on disk. Shots come in the order they were taken.
 
         Returns:
-            Name -> number, text, array, or lists and mappings of them: the shot's line in the results.
-            "shot" and "error" cannot be names of results.
+            The shot's line in the results, name -> number, text, array, or lists and mappings of them. "shot"
+            and "error" cannot be names of results.
         """
         ...
 
@@ -171,7 +170,7 @@ class NeedsWarmUp(Protocol):
     """A planner or detector with kernels to compile before the first shot."""
 
     def warm(self) -> None:
-        """Import every kernel that a shot will need; labseq then compiles or loads them."""
+        """Import every kernel that a shot will need. labseq then compiles or loads them."""
         ...
 
 
@@ -180,14 +179,14 @@ class ChoosesPlanner(Protocol):
     """A planner that chooses how it plans for a target, before the first shot."""
 
     def choose(self, target: TargetPattern, window_s: float) -> Sequence[str]:
-        """Choose, or recall what was chosen.
+        """Choose how to plan, or recall an earlier choice.
 
         Args:
             target: The target.
             window_s: Time from the start of the first cycle in which its batches must end.
 
         Returns:
-            What was chosen, then the alternatives, a line each, for ``labseq check`` and the log of the run.
+            The choice, then the alternatives, one line each, for ``labseq check`` and the log of the run.
         """
         ...
 
@@ -201,7 +200,7 @@ class ReportsSignals(Protocol):
 
     @property
     def signal_unit(self) -> str:
-        """Unit of the signals: "counts", "log-odds"."""
+        """Unit of the signals, for example "counts" or "log-odds"."""
         ...
 
     @property
@@ -211,9 +210,9 @@ class ReportsSignals(Protocol):
 
     @property
     def thresholds(self) -> NDArray[np.float64]:
-        """There is an atom where the signal exceeds the threshold, float64 (n_rows, n_cols)."""
+        """Thresholds, float64 (n_rows, n_cols). A site holds an atom if its signal exceeds its threshold."""
         ...
 
     def signals(self, frame: Frame) -> NDArray[np.float64]:
-        """The value that is compared with the threshold of each site, float64 (n_rows, n_cols)."""
+        """The values that are compared with the thresholds of the sites, float64 (n_rows, n_cols)."""
         ...

@@ -1,4 +1,4 @@
-"""What a driver offers to `labseq first-contact`: steps that measure what it assumes about its device."""
+"""Steps of a driver for `labseq first-contact`, which measure its assumptions about its device."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
 from labseq.roles.hardware import Emergency
 
 Instrument: TypeAlias = Literal["", "scope", "reference"]
-"""What a step needs beside the device: nothing, an oscilloscope at its outputs, a 10 MHz reference."""
+"""Instrument that a step needs, none, an oscilloscope at the outputs or a 10 MHz reference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,10 +20,10 @@ class Reading:
 
     Attributes:
         name: Its key in the result.
-        about: What to read, for the question.
-        dimension: A key of :data:`labseq.units.UNITS`; "fraction" for a plain number.
+        about: Description of the number, for the question.
+        dimension: A key of :data:`labseq.units.UNITS`, which is "fraction" for a plain number.
         low: Smallest value that makes sense, in SI.
-        high: Largest one.
+        high: Largest value that makes sense, in SI.
     """
 
     name: str
@@ -39,12 +39,12 @@ class ContactStep:
 
     Attributes:
         name: Its key in the result, and the value of ``--step``.
-        does: What it does to the device and its outputs, for the question before it.
+        does: Its effect on the device and its outputs, for the question before it.
         limit_s: Time after which it is abandoned and the device made safe, in seconds.
-        run: Does it; returns JSON values in SI. The key "skipped" says why there is nothing to measure.
-        needs: What must be connected.
-        prepare: What the user connects and sets first; "" for nothing.
-        readings: What the user reads afterwards, with the outputs off.
+        run: Does the step and returns JSON values in SI. If there is nothing to measure, "skipped" says why.
+        needs: The instrument that must be connected.
+        prepare: Instruction to connect and set up the instrument first. "" for nothing.
+        readings: Numbers that the user reads afterwards, with the outputs off.
     """
 
     name: str
@@ -62,8 +62,8 @@ class FirstContact(ABC):
     Attributes:
         is_simulated: Whether the device exists only in software.
         steps: The steps in their order.
-        units: Result -> its unit, for the page, where its name does not end in it; of a table one per
-            column. "bits" is for a number whose bits have meanings.
+        units: Result -> its unit, for the page, if its name does not end in the unit. A table has one unit
+            per column. "bits" is for a number whose bits have meanings.
     """
 
     is_simulated: bool = False
@@ -75,7 +75,7 @@ class FirstContact(ABC):
         """Open the device with its outputs off.
 
         Returns:
-            "serial", "model", "driver" and "firmware" as text; "" for what the device does not tell.
+            "serial", "model", "driver" and "firmware" as text. "" if the device does not report it.
 
         Raises:
             DeviceError: There is no such device, it is another model, or another program uses it.
@@ -83,11 +83,11 @@ class FirstContact(ABC):
 
     @abstractmethod
     def safe_state(self) -> None:
-        """Switch the outputs off; idempotent and legal in any state."""
+        """Switch the outputs off. Idempotent and legal in any state."""
 
     @abstractmethod
     def close(self) -> None:
-        """Close the device; legal in any state."""
+        """Close the device. Legal in any state."""
 
     def emergency(self) -> Emergency | None:
         """As ``Hardware.emergency``."""
@@ -95,19 +95,19 @@ class FirstContact(ABC):
 
     @abstractmethod
     def judge(self, measured: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Any]:
-        """Compare what was measured with what the driver assumes.
+        """Compare the measurements with the assumptions of the driver.
 
         Args:
-            measured: Step -> its result; without the steps that were not taken.
+            measured: Step -> its result, without the steps that were not taken.
 
         Returns:
-            "reason", which names everything that differs; beside it what follows, such as "stream".
+            "reason", which names every difference, and conclusions such as "stream".
         """
 
 
 @runtime_checkable
 class OffersFirstContact(Protocol):
-    """A driver that proves what it assumes. The method is called on a driver that is closed."""
+    """A driver that can check its assumptions. The method is called on a driver that is closed."""
 
     def first_contact(self) -> FirstContact:
         """The steps, which use the device instead of the driver."""

@@ -1,4 +1,4 @@
-"""The roles of hardware: base classes of drivers.
+"""The base classes of drivers, one for each role of hardware.
 
 Every driver implements the abstract methods. The others are optional abilities, whose defaults do nothing.
 """
@@ -22,9 +22,10 @@ from labseq.model import CameraFacts, Frame, LineProgram, LinesFacts, ToneProgra
 LineTrigger = Literal["external", "external_start", "bulb"]
 """How a line starts exposures.
 
-"external": an edge at the trigger input starts each one. "external_start": one edge starts the series, in
-which the camera times the exposures itself and ignores later edges. "bulb": the camera exposes as long as the
-input is on."""
+With "external" an edge at the trigger input starts each exposure. With "external_start" one edge starts the
+series, and the camera times the exposures itself and ignores later edges. With "bulb" the camera exposes as
+long as the input is on.
+"""
 
 Trigger = Literal["software", "internal", LineTrigger]
 """What starts an exposure: labseq, the camera's own clock, or a line."""
@@ -35,12 +36,12 @@ class Emergency:
     """How another process brings a device to its safe state after the run has died or hangs.
 
     The script is loaded by its path and may import the standard library and pyserial only. It defines
-    ``off(**arguments) -> str``, which is idempotent, raises with the reason, and returns in a few words what
-    was done. It may also define ``prepare(**arguments)``, which loads libraries and leaves the device alone.
+    ``off(**arguments) -> str``, which is idempotent, raises with the reason, and describes its action in a
+    few words. It may also define ``prepare(**arguments)``, which only loads libraries.
 
     Attributes:
-        script: A Python file beside the driver.
-        arguments: JSON values: port, card, bytes, register values, known once the device is open.
+        script: A Python file next to the driver.
+        arguments: JSON values known once the device is open, such as port, card, bytes or register values.
     """
 
     script: Path
@@ -52,29 +53,29 @@ class Hardware(ABC):
 
     Attributes:
         any_thread: Whether the vendor's library allows calls from different threads. By default each device
-            has a thread of its own for all calls; waking it takes 0.1 ms. ``safe_state`` of a device
-            that says True may be called while another call hangs.
+            has its own thread for all calls, and waking it takes 0.1 ms. If True, ``safe_state`` may be
+            called while another call hangs.
     """
 
     any_thread: ClassVar[bool] = False
 
     @abstractmethod
     def open(self) -> None:
-        """Connect and initialise; the first call that may do I/O.
+        """Connect and initialise. This is the first call that may do I/O.
 
-        It turns no output on: the watchdog learns only afterwards how to switch the device off.
+        It turns no output on, because the watchdog learns only afterwards how to switch the device off.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Disconnect; legal in any state."""
+        """Disconnect. Legal in any state."""
 
     @abstractmethod
     def safe_state(self) -> None:
-        """Make all outputs harmless; idempotent and legal in any state."""
+        """Make all outputs harmless. Idempotent and legal in any state."""
 
     def emergency(self) -> Emergency | None:
-        """How another process brings this device to its safe state; called right after ``open()``.
+        """How another process brings this device to its safe state. Called right after ``open()``.
 
         None if it has no output to switch off.
         """
@@ -82,66 +83,67 @@ class Hardware(ABC):
 
     @abstractmethod
     def describe(self) -> Mapping[str, Any]:
-        """Model, serial number, firmware, current settings: JSON-ready values.
+        """Model, serial number, firmware and current settings as JSON-ready values.
 
-        Under "units", exports find the unit of each value that :meth:`poll` gives: name -> unit, in SI.
+        Exports look up the SI units of the values of :meth:`poll` under "units", name -> unit.
         """
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
         """Versions of packages, libraries and firmware of the open device, for ``labseq devices``.
 
-        Each name -> the version found, and those that the driver was tried with, separated by ", "; "" where
-        there is none.
+        Name -> the version found, and the versions that the driver was tried with, separated by ", ". Either
+        is "" if there is none.
         """
         return {}
 
     @property
     def idle_output(self) -> str:
-        """What it puts out when nothing plays, in a few words for ``labseq check``; "" for nothing."""
+        """Its output when nothing plays, in a few words for ``labseq check``. "" for no output."""
         return ""
 
     def check_settings(self) -> Mapping[str, Problem]:
-        """Setting -> what is wrong with it that a look at the computer shows, such as a missing file.
+        """Check settings against this computer, for example for a missing file. Returns setting -> problem.
 
         Called by ``labseq check`` and before a run's folder is made, without touching hardware.
         """
         return {}
 
     def warm(self) -> None:
-        """Import every kernel that a shot needs, before ``open()``; labseq then compiles or loads them."""
+        """Import every kernel that a shot needs, before ``open()``. labseq then compiles or loads them."""
 
     @property
     def settling_timeout_s(self) -> float:
-        """Longest time that :meth:`settle` may take, in seconds; 0 if there is nothing to wait for."""
+        """Longest time that :meth:`settle` may take, in seconds. 0 if there is nothing to wait for."""
         return 0.0
 
     def settle(self) -> None:
-        """Wait until the device is ready, for example until a camera is cold; all devices are open.
+        """Wait until the device is ready, for example until a camera is cold. All devices are open.
 
         Raises:
             DeviceTimeoutError: It is not ready after ``settling_timeout_s`` on the session's clock.
         """
 
     def self_test(self) -> None:
-        """Check the open device without light and without moving anything; for ``labseq devices``.
+        """Check the open device without light and without moving anything, for ``labseq devices``.
 
         Raises:
-            DeviceError: The device does not work; says why.
+            DeviceError: The device does not work. The message says why.
         """
 
     def poll(self) -> Mapping[str, bool | int | float | str]:
-        """Read the values to record at the start of each shot; each becomes the reading "device.name".
+        """Read the values to record at the start of each shot. Each becomes the reading "device.name".
 
-        If the driver's settings have a property ``polled`` with the names, a sequence cannot measure others.
+        If the driver's settings have a property ``polled`` with the names, a sequence can measure only these.
         """
         return {}
 
     def check_interlocks(self) -> None:
-        """Read the watched values; called at the start of each shot and before each pick-up of atoms.
+        """Read the watched values. Called at the start of each shot and before each pick-up of atoms.
 
         Raises:
-            DeviceError: A value exceeds its limit; the run ends safely.
-            ShotAbortedError: The external control system aborted the shot; it is repeated at the next `go`.
+            DeviceError: A value exceeds its limit. The run ends safely.
+            ShotAbortedError: The external control system aborted the shot, which is repeated at the next
+                `go`.
         """
 
 
@@ -153,24 +155,23 @@ class Camera(Hardware):
 
     @property
     def facts(self) -> CameraFacts:
-        """Read-out time, longest exposure, frame shape, EM gain and triggers; also before ``open()``."""
+        """Read-out time, longest exposure, frame shape, EM gain and triggers. Known before ``open()``."""
         return CameraFacts()
 
     @abstractmethod
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
-        """Get ready for a series of ``n_frames`` exposures; the internal trigger starts them at once.
+        """Get ready for a series of ``n_frames`` exposures. The internal trigger starts them at once.
 
-        With "bulb" ``exposure_s`` is how long the line will be on, which is not sent to the camera.
-
-        A shot arms once for all its images with the same exposure time, as many as it may need at most.
+        With "bulb" ``exposure_s`` is how long the line will be on, which is not sent to the camera. A shot
+        arms once for all its images with the same exposure time, for the most that it may need.
         """
 
     def disarm(self) -> None:
-        """End the series, EM gain to 1: other light may reach the camera now; legal in any state."""
+        """End the series, with EM gain 1 in case other light reaches the camera. Legal in any state."""
 
     @abstractmethod
     def trigger(self) -> None:
-        """Start the next exposure of the series (software trigger); returns at once."""
+        """Start the next exposure of the series (software trigger). Returns at once."""
 
     @abstractmethod
     def read(self, timeout_s: float) -> Frame:
@@ -178,7 +179,7 @@ class Camera(Hardware):
 
         Raises:
             DeviceTimeoutError: No frame came within ``timeout_s``.
-            TransientError: A frame of the series was lost; repeating the shot may help.
+            TransientError: A frame of the series was lost. Repeating the shot may help.
         """
 
 
@@ -187,19 +188,19 @@ class StaticTweezers(Hardware):
 
     @property
     def facts(self) -> TweezersFacts:
-        """What labseq can set, how ramps are timed, whether atoms can be released; also before ``open()``."""
+        """Which controls, ramp timing and release of atoms the device offers. Known before ``open()``."""
         return TweezersFacts()
 
     @abstractmethod
     def load(self, amplitudes: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> None:
         """Set the tone amplitudes of the rows (n_rows,) and columns (n_cols,).
 
-        Fractions of full scale; None means the calibrated ones, also of weights. Called with amplitudes only
+        Fractions of full scale. None means the calibrated amplitudes and weights. Called with amplitudes only
         if ``facts.control`` is "tones".
         """
 
     def load_weights(self, weights: NDArray[np.float64]) -> None:
-        """Set the share of the light that each site is to have, float64 (n_rows, n_cols).
+        """Set the share of the light for each site, float64 (n_rows, n_cols).
 
         Only their ratios count. Called only if ``facts.control`` is "sites".
         """
@@ -207,7 +208,7 @@ class StaticTweezers(Hardware):
 
     @abstractmethod
     def start(self) -> None:
-        """Bring the array to its nominal depth, from off or after a ramp; no effect if it is there.
+        """Bring the array to its nominal depth, from off or after a ramp, unless it is there already.
 
         Each shot begins with it.
         """
@@ -217,28 +218,28 @@ class StaticTweezers(Hardware):
         """Change the depth linearly, to a fraction of the nominal depth.
 
         Raises:
-            LimitError: A depth that they cannot have; without ``facts.ramps`` any but 0 and 1.
+            LimitError: The depth is out of range, or neither 0 nor 1 for tweezers without ``facts.ramps``.
         """
 
     def release(self, duration_s: float) -> float:
         """Turn the light off for a time that the device itself keeps, then on again at the same depth.
 
-        One command to the device must do both: the light returns even if labseq is killed meanwhile, or the
-        device makes itself safe. Called only if ``facts.shortest_release_s`` is finite.
+        One command to the device must do both, so that the light returns even if labseq is killed meanwhile,
+        or the device makes itself safe. Called only if ``facts.shortest_release_s`` is finite.
 
         Returns:
-            The time without light, in seconds; when it is over.
+            The time without light, in seconds. Returns when it is over.
         """
         raise NotImplementedError("these static tweezers cannot release atoms")
 
     def leave_on(self) -> bool:
-        """Disconnect and leave the light on, if the profile asks for it; after a run that took all its shots.
+        """Disconnect and leave the light on after a complete run, if the profile asks for it.
 
         From then on ``safe_state`` and ``close`` have no effect, and no watchdog knows of the light. The next
-        ``open()``, as of ``labseq safe``, must be able to switch it off.
+        ``open()``, for example by ``labseq safe``, must be able to switch it off.
 
         Returns:
-            Whether the light was left on; if not, or if this fails, ``safe_state`` and ``close`` follow.
+            Whether the light was left on. If not, or if this fails, ``safe_state`` and ``close`` follow.
         """
         return False
 
@@ -248,18 +249,18 @@ class MobileTweezers(Hardware):
 
     @property
     def waits_for_trigger(self) -> bool:
-        """Whether ``play`` only arms them, and an edge at their input starts them; also before ``open()``.
+        """True if ``play`` only arms them, and an edge at their input starts them. Known before ``open()``.
 
-        Drivers that can do so do it if ``trigger_line(context.lines, "mobile_tweezers")`` names a line.
+        Drivers with this ability use it if ``trigger_line(context.lines, "mobile_tweezers")`` names a line.
         """
         return False
 
     def warnings(self) -> Sequence[str]:
-        """What ``labseq check`` and a run warn of, such as motion that the device can only approximate."""
+        """Warnings for ``labseq check`` and runs, such as motion that the device can only approximate."""
         return ()
 
     def check_program(self, program: ToneProgram) -> None:
-        """Refuse before the device is opened what ``prepare`` would refuse; nothing is sent.
+        """Check before opening, without sending anything, that ``prepare`` would accept a program.
 
         Raises:
             LimitError: The program exceeds a limit that the settings imply.
@@ -278,7 +279,7 @@ class MobileTweezers(Hardware):
 
     @abstractmethod
     def play(self) -> None:
-        """Start playing the prepared program, or arm it for its trigger; returns at once."""
+        """Start playing the prepared program, or arm it for its trigger. Returns at once."""
 
     @abstractmethod
     def wait(self, timeout_s: float) -> None:
@@ -290,23 +291,23 @@ class MobileTweezers(Hardware):
 
     @property
     def start_delay_s(self) -> float:
-        """Time from ``play``, or from the trigger, to the first tones at the outputs; known once open."""
+        """Time from ``play`` or the trigger to the first tones at the outputs. Known once open."""
         return 0.0
 
     @property
     def beginning_s(self) -> float:
-        """Playing time after which a program can be cut and its rest follow by :meth:`append`; inf: never.
+        """Playing time of the beginning if a program is cut and :meth:`append` sends the rest. inf if never.
 
-        It is long enough to make the rest meanwhile. Tones are off where a program is cut.
+        It is long enough to compute the rest meanwhile. Tones are off where a program is cut.
         """
         return math.inf
 
     def prepare_beginning(self, program: ToneProgram) -> float:
-        """As :meth:`prepare`, for the beginning of a program; :meth:`append` follows right after ``play``."""
+        """As :meth:`prepare`, for the beginning of a program. :meth:`append` follows right after ``play``."""
         raise NotImplementedError("these mobile tweezers take whole programs only")
 
     def append(self, program: ToneProgram) -> None:
-        """Have the rest of a program follow what plays, at once, or after a pause if it comes too late.
+        """Play the rest of a program right after its beginning, or after a pause if it comes too late.
 
         Raises:
             LimitError: It exceeds a limit of the device.
@@ -315,7 +316,7 @@ class MobileTweezers(Hardware):
         raise NotImplementedError("these mobile tweezers take whole programs only")
 
     def timings(self) -> Mapping[str, float]:
-        """Durations of the parts of the last ``prepare()``, such as "render": name -> seconds of real time.
+        """Real time that each part of the last ``prepare()`` took, name -> seconds, for example "render".
 
         No I/O.
         """
@@ -323,7 +324,7 @@ class MobileTweezers(Hardware):
 
 
 class Device(Hardware):
-    """Any other instrument: a shutter, a laser controller, a synthesizer."""
+    """Any other instrument, such as a shutter, a laser controller or a synthesizer."""
 
     @abstractmethod
     def command(self, name: str, **arguments: Any) -> None:
@@ -334,28 +335,28 @@ class Device(Hardware):
         """Read one of the values that the device declares."""
 
     def check_command(self, name: str, **arguments: Any) -> None:
-        """Check a command and its arguments before the device is opened; nothing is sent.
+        """Check a command and its arguments before the device is opened, without sending anything.
 
         Raises:
-            DeviceError: The device has no such command, or the arguments differ.
+            DeviceError: The device has no such command, or the command takes other arguments.
             LimitError: An argument exceeds its limit.
         """
 
 
 class Lines(Hardware):
-    """The timing box that switches light and sends triggers; ``context.lines`` names its wired channels.
+    """The timing box that switches light and sends triggers. ``context.lines`` names its wired channels.
 
-    Between steps the lines are idle: on where :data:`labseq.model.lines.IDLE` says so. ``open()``
+    Between steps the lines are idle, which means on if :data:`labseq.model.lines.IDLE` says so. ``open()``
     leaves all of them off, as ``safe_state`` does.
     """
 
     @property
     def lines_facts(self) -> LinesFacts:
-        """Channels, number of edges and resolution; also before ``open()``."""
+        """Channels, number of edges and resolution. Known before ``open()``."""
         return LinesFacts(())
 
     def check_program(self, program: LineProgram) -> None:
-        """Refuse before the box is opened what ``compile`` would refuse; nothing is sent.
+        """Check before opening, without sending anything, that ``compile`` would accept a program.
 
         Raises:
             LimitError: The program has more edges, or edges closer together, than the box can make.
@@ -363,11 +364,11 @@ class Lines(Hardware):
 
     @abstractmethod
     def idle(self) -> None:
-        """Turn on the lines that are on between steps, and the others off; called once, after ``open()``."""
+        """Turn on the lines that are on between steps, and the others off. Called once, after ``open()``."""
 
     @abstractmethod
     def compile(self, program: LineProgram) -> None:
-        """Compile a program for the next firing; a program that was compiled before takes no time.
+        """Compile a program for the next firing. A program that was compiled before takes no time.
 
         Raises:
             LimitError: The program has more edges, or edges closer together, than the box can make.
@@ -379,11 +380,11 @@ class Lines(Hardware):
 
     @abstractmethod
     def fire(self) -> None:
-        """Start the program; returns at once."""
+        """Start the program. Returns at once."""
 
     @abstractmethod
     def wait(self, timeout_s: float) -> None:
-        """Wait for its end.
+        """Wait for the end of the program.
 
         Raises:
             DeviceTimeoutError: It did not end within ``timeout_s``.
@@ -414,7 +415,7 @@ class LeaderLink(Protocol):
             timeout_s: How long to wait, in seconds.
 
         Returns:
-            The text that came with the signal; "" if none.
+            The text that came with the signal, or "" if none.
 
         Raises:
             DeviceTimeoutError: It did not come in time.
@@ -423,45 +424,45 @@ class LeaderLink(Protocol):
         ...
 
     def report(self, state: Literal["ready", "failed"], about: Mapping[str, Any]) -> str:
-        """Answer the start signal; nothing is sent if there was none.
+        """Answer the start signal. Nothing is sent if there was none.
 
         Args:
             state: The outcome.
-            about: Details: "shot"; its "record" so far (``ShotRecord``), whose times count from "start_s" on
-                the session's clock; the "target". For a ready shot the folder of its "run" and in it the
-                "file" that it will be written to; if it was judged, "success" and "filling" (of the target,
+            about: Details. Always "shot", its "record" so far (``ShotRecord``), "start_s", from which the
+                record's times count on the session's clock, and the "target". For a ready shot the folder of
+                its "run" and the "file" in it, and if it was judged, "success" and "filling" (of the target,
                 0 to 1). For a failure its "reason".
 
         Returns:
-            The answer that the other system got: "ready", "failed"; "late" if a failure was reported when
-            the deadline passed; "gone" if it has disconnected; "" if no answer was due.
+            The answer that the other system got, "ready" or "failed". "late" if a failure was reported when
+            the deadline passed, "gone" if it has disconnected, "" if no answer was due.
         """
         ...
 
     def new_events(self) -> Sequence[str]:
-        """Messages for the log since the last call: connections, and texts that were not understood."""
+        """Messages for the log since the last call, about connections and texts that were not understood."""
         ...
 
 
 @runtime_checkable
 class LeaderDialogue(LeaderLink, Protocol):
-    """A link that carries more than edges: values for a shot, images, steps and light of the other system."""
+    """A link that also carries values for a shot, images, and steps and light of the other system."""
 
     @property
     def asks_for_light(self) -> bool:
-        """Whether the other system turns the imaging light on when it is asked to."""
+        """Whether the other system turns the imaging light on when labseq asks for it."""
         ...
 
     def expect_values(self, check: Callable[[Mapping[str, str]], object]) -> None:
-        """From now on, check values that the other system sends in advance by this function, which raises."""
+        """From now on, check values that the other system sends in advance with this function, or raise."""
         ...
 
     def take_values(self) -> Mapping[str, str]:
-        """The values that it has sent for the shot that begins: address -> value as for ``--set``."""
+        """The values that it has sent for the shot that begins, address -> value as for ``--set``."""
         ...
 
     def take_turn(self, step: str, timeout_s: float, shot: int) -> str:
-        """Let the other system do a step of its own; returns the text with which it reports the end.
+        """Let the other system do a step of its own. Returns the text with which it reports the end.
 
         Raises:
             TransientError: It is not connected, leaves, or does not report the end in time.
@@ -469,7 +470,7 @@ class LeaderDialogue(LeaderLink, Protocol):
         ...
 
     def light_on(self, exposure_s: float, shot: int) -> None:
-        """Have it turn the imaging light on; returns once the light is on.
+        """Have it turn the imaging light on. Returns once the light is on.
 
         Raises:
             TransientError: As for a step.
@@ -477,16 +478,16 @@ class LeaderDialogue(LeaderLink, Protocol):
         ...
 
     def light_off(self, shot: int) -> None:
-        """Have it turn the light off. Until it has, ``check_interlocks`` waits, and raises at last."""
+        """Have it turn the light off. ``check_interlocks`` waits for that, and raises in the end."""
         ...
 
     def report_image(self, about: Mapping[str, Any]) -> None:
-        """Tell an image if it has asked for that: "shot", "image" (``ImageRecord``), "target", "start_s"."""
+        """Send an image if it wants them, as "shot", "image" (``ImageRecord``), "target", "start_s"."""
         ...
 
 
 def leaders(devices: Mapping[str, object]) -> Iterator[tuple[str, LeaderLink]]:
-    """Name and device, of the devices or lines that can receive the signals of another control system."""
+    """Name and device of all devices and lines that can receive signals of another control system."""
     for name, device in devices.items():
         if isinstance(device, LeaderLink):
             yield name, device
@@ -497,26 +498,26 @@ def find_leader(devices: Mapping[str, object], name: str = "") -> tuple[str, Lea
 
     Args:
         devices: All hardware of the profile.
-        name: Name of the device; "" for the only one that can receive signals.
+        name: Name of the device. "" for the only one that can receive signals.
 
     Raises:
-        ConfigError: It cannot receive one, no device can, or several can.
+        ConfigError: This device cannot receive signals, no device can, or several can.
     """
     able = dict(leaders(devices))
     if name in able:
         return name, able[name]
     if name:
-        fault = f"no other control system leads through '{name}'"
+        fault = f"'{name}' cannot receive signals of another control system"
         raise ConfigError(Problem(fault, expected=one_of(list(able))) if able else fault)
     if not able:
-        fault = "the profile has no device through which another control system leads"
+        fault = "the profile has no device that receives signals of another control system"
         hint = (
-            "add one to its `devices`: `leader: {use: tcp_leader}`; in a full dry run it says `go` itself, "
-            "in a fast one it is missing"
+            "add `leader: {use: tcp_leader}` to its `devices` (a full dry run simulates it and sends `go`, "
+            "a fast dry run leaves it out)"
         )
         raise ConfigError(Problem(fault, hint=hint))
     if len(able) > 1:
-        raise ConfigError(f"several devices lead; set `device` to {one_of(list(able))}")
+        raise ConfigError(f"several devices receive signals; set `device` to {one_of(list(able))}")
     return next(iter(able.items()))
 
 
@@ -526,13 +527,13 @@ def unknown_name(device: str, kind: str, name: str, names: Sequence[str]) -> Dev
     Args:
         device: Name of the device.
         kind: "command" or "value".
-        name: The name that it does not know.
-        names: What it has.
+        name: The unknown name.
+        names: The names that it knows.
 
     Example:
         >>> str(unknown_name("shutter", "command", "opne", ["open", "close"]))
         "shutter: unknown command 'opne'; expected one of 'open', 'close'; did you mean 'open'?"
     """
-    message = f"unknown {kind} '{clean(name)}'; expected {one_of(names) if names else 'none: it has none'}"
+    message = f"unknown {kind} '{clean(name)}'; expected {one_of(names) if names else 'none, as it has none'}"
     hint = did_you_mean(name, names)
     return DeviceError(device, f"{message}; {hint}" if hint else message)

@@ -1,4 +1,4 @@
-"""The interfaces for steps: the clock, the shot, and the step itself."""
+"""The interfaces for steps, which are the clock, the shot, and the step itself."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class Clock(Protocol):
-    """The session's time: real, or virtual where no device needs real time."""
+    """The session's time, which is real, or virtual if no device needs real time."""
 
     @property
     def virtual(self) -> bool:
@@ -56,12 +56,12 @@ class Clock(Protocol):
         ...
 
     def check(self) -> None:
-        """Raise ``StopRequested`` if the operator asked the run to stop; returns at once otherwise."""
+        """Raise ``StopRequested`` if the operator asked the run to stop. Otherwise returns at once."""
         ...
 
 
 class NeverStopped:
-    """A real clock without stop requests; for plugins used outside of a run."""
+    """A real clock without stop requests, for plugins used outside of a run."""
 
     virtual = False
 
@@ -87,16 +87,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """The argument of a plugin's factory next to its settings: grid, clock, random numbers, ...
+    """The grid, clock, random numbers and more, which a plugin's factory gets next to its settings.
 
     Attributes:
-        name: Role or device name in the profile: "camera", "planner", "shutter".
+        name: Role or device name in the profile, such as "camera", "planner" or "shutter".
         grid: The grid of sites.
         motion: How the mobile tweezers move.
-        clock: The session's time; drivers wait with ``clock.sleep``.
+        clock: The session's time. Drivers wait with ``clock.sleep``.
         random: The plugin's own random number generator.
-        calibrations: Calibrations in use: kind -> entry.
-        simulation: The simulation; None if the profile has none.
+        calibrations: Calibrations in use, kind -> entry.
+        simulation: The simulation. None if the profile has none.
         lines: The lines of the timing box.
     """
 
@@ -165,17 +165,17 @@ class Shot(Protocol):
 
     @property
     def calibrations(self) -> Mapping[str, CalibrationEntry]:
-        """Calibrations in use: kind -> entry."""
+        """Calibrations in use, kind -> entry."""
         ...
 
     @property
     def frame(self) -> Frame | None:
-        """Frame of the last image of this shot; None before the first."""
+        """Frame of the last image of this shot. None before the first."""
         ...
 
     @property
     def occupancy(self) -> Occupancy | None:
-        """Occupancy on the last image of this shot; None before the first."""
+        """Occupancy on the last image of this shot. None before the first."""
         ...
 
     @property
@@ -213,17 +213,17 @@ class Shot(Protocol):
         ...
 
     def judge(self) -> None:
-        """Decide on the image just taken whether the shot succeeded."""
+        """Decide from the image just taken whether the shot succeeded."""
         ...
 
     def call(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """Call a device or plugin with a time limit; obeys stop requests during the call.
+        """Call a device or plugin with a time limit. Obeys stop requests during the call.
 
         Args:
             owner: Role or device name, for the error message.
-            timeout_s: Maximum time of the call in seconds; after it, the device counts as hung.
+            timeout_s: Maximum time of the call in seconds. After it, the device counts as hung.
             function: For example ``shot.mobile_tweezers.play``.
             *args: Passed on to it.
             **kwargs: Passed on to it.
@@ -236,7 +236,7 @@ class Shot(Protocol):
         ...
 
     def check_interlocks(self) -> None:
-        """Check the interlocks of every device; before atoms are picked up.
+        """Check the interlocks of every device before atoms are picked up.
 
         Raises:
             DeviceError: A value exceeds its limit.
@@ -246,12 +246,12 @@ class Shot(Protocol):
     def follow(self, signal: str, timeout_s: float, device: str = "") -> None:
         """Wait for the start signal of another control system, which will receive the outcome of this shot.
 
-        At a second wait in a shot, labseq first answers `ready` to the signal before.
+        At a second wait in a shot, labseq first answers `ready` to the earlier signal.
 
         Args:
             signal: "go".
             timeout_s: How long to wait, in seconds.
-            device: Name of the device that receives the signal; "" for the only one there is.
+            device: Name of the device that receives the signal. "" for the only one.
 
         Raises:
             ConfigError: There is no such device.
@@ -266,7 +266,7 @@ class Shot(Protocol):
         Args:
             step: Name of the step.
             timeout_s: Longest time until it reports the end, in seconds.
-            device: Name of the device that it speaks through; "" for the only one there is.
+            device: Name of the device that it speaks through. "" for the only one.
 
         Raises:
             ConfigError: There is no such device.
@@ -290,27 +290,27 @@ class Shot(Protocol):
         start: Callable[[], object] | None = None,
         pulses: Pulses = NO_PULSES,
     ) -> AbstractContextManager[None]:
-        """Context manager for the work of a step: its lines switch on before it and off after it.
+        """Context manager for the work of a step, which switches the step's lines on before and off after.
 
         Args:
-            kind: Kind of the step, as the profile's lines name it: "image".
+            kind: Kind of the step, as the profile's lines name it, for example "image".
             duration_s: Duration of the step, in seconds.
-            start: Starts the step's device when the step begins, or arms it before the lines are fired if
-                one of them triggers it.
-            pulses: When the step itself turns lines on, from its beginning: line -> (start, end), in seconds.
+            start: Starts the step's device when the step begins, or arms it before the lines are fired if a
+                line triggers it.
+            pulses: Pulses that the step itself makes, line -> (start, end) in seconds from its beginning.
         """
         ...
 
     def release(self, duration_s: float) -> float:
-        """Turn the static tweezers off for a time that the timing box or the tweezers' own driver keeps.
+        """Turn the static tweezers off for a time kept by the timing box or the tweezers' own driver.
 
         Returns:
-            The time without light, in seconds; when it is over.
+            The time without light, in seconds. Returns when it is over.
         """
         ...
 
     def record_duration(self, planned_s: float, achieved_s: float) -> None:
-        """Record the duration that hardware kept, in the place of that of the whole step."""
+        """Record the duration kept by hardware, instead of the duration of the whole step."""
         ...
 
     def stage(self, name: str, budget_s: float = ..., cycle: int = -1) -> AbstractContextManager[None]:
@@ -323,11 +323,11 @@ class Shot(Protocol):
         """Record a stage that has just ended, where :meth:`stage` cannot be used.
 
         Args:
-            name: Of the stage.
+            name: Name of the stage.
             duration_s: Its duration on the session's clock, in seconds.
-            host_s: The same on this computer's clock.
-            budget_s: Its budget; by default that of the profile's ``budgets``.
-            cycle: Index of the rearrangement cycle; -1 outside of one.
+            host_s: Its duration on this computer's clock, in seconds.
+            budget_s: Its budget. Default is the profile's ``budgets``.
+            cycle: Index of the rearrangement cycle. -1 outside of a cycle.
         """
         ...
 
@@ -338,10 +338,10 @@ class Shot(Protocol):
     def take_frame(
         self, camera: str, exposure_s: float, light: AbstractContextManager[object] | None = None
     ) -> Frame:
-        """Take a frame of anything but atoms: no line is switched, nothing is detected or recorded.
+        """Take a frame of anything but atoms, without switching lines, detecting or recording.
 
         Args:
-            camera: "camera" for that of the atoms, or a device of the profile with ``role: camera``.
+            camera: "camera" for the camera of the atoms, or a device of the profile with ``role: camera``.
             exposure_s: Exposure time, in seconds.
             light: Entered when the camera is ready, before the exposure, and left after the frame has come.
 
@@ -356,7 +356,7 @@ class Shot(Protocol):
         ...
 
     def note(self, name: str, value: float | Sequence[Any]) -> None:
-        """Record a value, or lists of values, among the shot's readings: "overlay.error_m"."""
+        """Record a value, or lists of values, among the shot's readings, for example as "overlay.error_m"."""
         ...
 
     def log(self, event: str, **values: Any) -> None:
@@ -391,14 +391,14 @@ class StepContext:
         return margin_s(self.lines, kind)
 
     def timed_by(self, kind: str) -> TimedBy:
-        """What times such a step: the timing box if a line is on in it but not when idle, or the computer."""
+        """Device that times such a step, the timing box if it switches a line on in it, else the computer."""
         if any(IDLE not in spec.on and not spec.pulse_s for spec in lines_of(self.lines, kind)):
             return TimedBy("lines", self.lines_facts.resolution_s)
         return COMPUTER
 
     @property
     def release_by(self) -> TimedBy | None:
-        """What times a release: a line that turns the static tweezers off, or their driver; None: nothing."""
+        """Device that times a release, either the timing box or the tweezers' driver. None if neither can."""
         if any(spec.turns_off == "static_tweezers" for spec in self.lines):
             return TimedBy("lines", self.lines_facts.resolution_s)
         if self.static_tweezers.shortest_release_s < math.inf:
@@ -414,17 +414,18 @@ class Step(ABC):
         needs_image: Whether an image must have been taken before it in the shot.
         takes_image: Whether it leaves an image to the steps after it.
         repeatable: Whether it may be retried in the same shot when it fails, because it leaves the atoms
-            where they are; other steps are only repeated with the whole shot.
+            where they are. Other steps are only repeated with the whole shot.
         takes_time: Whether a line can be on during it.
-        device_setting: Name of its setting that names a device of the profile; "" if it has none.
-        device_may_be_camera: Whether that may be a camera: a device with ``role: camera``, or "camera".
-        signal: Start signal of another control system that it waits for ("go"); "" if it waits for none.
-        device: Name of the device that receives the signal; "" for the only one there is.
-        windows_s: Longest time for the moves of each of its rearrangement cycles, in seconds; `labseq check`
+        device_setting: Name of its setting that names a device of the profile. "" if it has none.
+        device_may_be_camera: Whether that may be a camera, which is a device with ``role: camera`` or
+            "camera".
+        signal: Start signal of another control system that it waits for ("go"). "" if it waits for none.
+        device: Name of the device that receives the signal. "" for the only one.
+        windows_s: Longest time for the moves of each of its rearrangement cycles, in seconds. `labseq check`
             compares the planner's moves with them.
-        judges_shot: Whether a shot whose last rearrangement it is needs no further image.
-        notes: Names of the readings that it records by :meth:`Shot.note`, or their beginnings up to a dot;
-            None if they are not known before the run. A sequence may measure what its steps note.
+        judges_shot: True if a shot that ends with this rearrangement needs no further image.
+        notes: Names of the readings that it records by :meth:`Shot.note`, or their beginnings up to a dot.
+            None if they are not known before the run. A sequence may measure these readings.
     """
 
     needs_image: bool = False
@@ -457,21 +458,21 @@ class Step(ABC):
 
         Args:
             devices: All hardware of the profile by its name, constructed.
-            context: What is known of them.
+            context: The facts of the devices, the grid and the target.
 
         Returns:
-            Setting -> what is wrong with it, as text or, with what was expected and a hint, as a ``Problem``
-            without a place; empty if nothing is. A setting within others has dots: "parts.dark.duration".
+            Setting -> the problem, as text, or as a ``Problem`` without a place if it has an expected value
+            and a hint. A setting within others has dots, as "parts.dark.duration".
         """
         return {}
 
 
 EVENTS: Final = {
-    "run_starting": "the run has its folder; its devices are opened next",
+    "run_starting": "the run has its folder, and its devices are opened next",
     "compiling": "kernels are compiled, which happens once on each computer",
-    "compiled": "they are, with the time it took",
+    "compiled": "the kernels are compiled, with the time it took",
     "settling": "labseq waits for a device to settle, such as a camera that cools down",
-    "planner_chosen": "what the planner has chosen for the target, and why",
+    "planner_chosen": "the planner's choice for the target, and the reason",
     "run_started": "all devices are open",
     "state": "the state of the run has changed: opening, idle, shot, writing, recovering, ...",
     "shot_started": "an attempt at a shot begins",
@@ -490,27 +491,27 @@ EVENTS: Final = {
     "leader_signal": "the signal has come",
     "leader_answered": "labseq has answered it",
     "leader_turn": "the external control system does a step of its own",
-    "leader_event": "what else the link to the external control system reports",
+    "leader_event": "another message of the link to the external control system",
     "shot_repeated": "an attempt failed, and the shot is taken again",
     "shot_finished": "a shot is on disk, complete or not",
-    "clock_jumped": "the computer slept or its clock was set since the shot before; a reading, too",
+    "clock_jumped": "the computer slept or its clock was set since the last shot (also a reading)",
     "shots_skipped": "a policy skipped shots, with the reason",
-    "scan_point": "a shot of an adaptive scan is on disk: the point so far, and the best one",
+    "scan_point": "a shot of an adaptive scan is on disk, with the point so far and the best point",
     "scan_ended": "the scanner chose no further point",
-    "scan_result": "an adaptive scan is over: the best point, its value with error, and the suggested values",
-    "ended_early": "the fits are as precise as `stop_when` asks, and the run ends: the parameters, and the "
-    "number of shots that are left",
-    "warning": "something that the user should know; the run continues",
+    "scan_result": "an adaptive scan is over, with the best point, its value and error, and suggested values",
+    "ended_early": "the fits are as precise as `stop_when` asks, and the run ends, with the parameters and "
+    "the number of shots left",
+    "warning": "a warning for the user, after which the run continues",
     "left_on": "the static tweezers stay on after the run",
     "safe_state": "a device was brought to its safe state, or could not be",
     "closed": "a device was closed, or could not be",
-    "run_finished": "the run has ended, in whatever way; all devices are in their safe state",
+    "run_finished": "the run has ended for any reason, and all devices are in their safe state",
 }
-"""Event of a run -> what has happened."""
+"""Event of a run -> its meaning."""
 
 
 class RunObserver(Protocol):
-    """Receives the events of a run: the live view, a log. Its failures never stop the run."""
+    """Receives the events of a run, as the live view or a log does. Its failures never stop the run."""
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         """Receive an event, one of :data:`EVENTS`."""

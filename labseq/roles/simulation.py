@@ -24,11 +24,11 @@ Signal: TypeAlias = ToneProgram | DepthRamp | TweezerAmplitudes | LineProgram
 """The output of a device that the simulation acts on."""
 
 WHOLE_SENSOR: Final = SensorMode()
-"""Default mode: the whole sensor with the simulation's own gain."""
+"""Default mode, with the whole sensor and the simulation's own gain."""
 
 
 class Simulation(ABC):
-    """The atoms, tweezers and light of a simulated lab; one per run, opened before the devices.
+    """The atoms, tweezers and light of a simulated lab. A run has one, opened before the devices.
 
     Methods with a default are optional, as in :mod:`labseq.roles.hardware`.
     """
@@ -43,21 +43,21 @@ class Simulation(ABC):
 
     @abstractmethod
     def begin_shot(self) -> None:
-        """Remove all atoms; called after the random stream was set to the shot."""
+        """Remove all atoms. Called after the random stream was set to the shot."""
 
     @abstractmethod
     def load(self, t_start_s: float, duration_s: float) -> None:
-        """The atom source is on: load every site whose static tweezer is on."""
+        """Load every site whose static tweezer is on, while the atom source is on."""
 
     @abstractmethod
     def play(self, role: str, signal: Signal, t_start_s: float) -> None:
         """Receive the output of a device that begins at ``t_start_s``.
 
         Args:
-            role: "mobile_tweezers", which plays a ``ToneProgram``; "static_tweezers": ``DepthRamp`` or
-                ``TweezerAmplitudes``; "lines": ``LineProgram``.
+            role: "mobile_tweezers" for a ``ToneProgram``, "static_tweezers" for ``DepthRamp`` or
+                ``TweezerAmplitudes``, or "lines" for a ``LineProgram``.
             signal: The output.
-            t_start_s: When it begins, on the session's clock.
+            t_start_s: Start of the output on the session's clock.
         """
 
     @abstractmethod
@@ -72,22 +72,22 @@ class Simulation(ABC):
 
     @abstractmethod
     def describe(self) -> Mapping[str, Any]:
-        """Every constant of the model: JSON-ready values."""
+        """Every constant of the model, as JSON-ready values."""
 
     @property
     def sensor_shape(self) -> tuple[int, int] | None:
-        """(height, width) in pixels of the sensor, also before ``open()``; None if it describes none."""
+        """(height, width) in pixels of the sensor, also before ``open()``. None if it has no sensor."""
         return None
 
     def warm(self) -> None:
-        """Import every kernel that a shot needs, before ``open()``; labseq then compiles or loads them."""
+        """Import every kernel that a shot needs, before ``open()``. labseq then compiles or loads them."""
 
     def warnings(self) -> Sequence[str]:
-        """What ``labseq check`` and a run warn of, such as settings beyond the range of the model."""
+        """Warnings for ``labseq check`` and runs, such as settings beyond the range of the model."""
         return ()
 
     def readout_fraction(self, mode: SensorMode) -> float:
-        """Time to read a frame, relative to that of the whole sensor without binning."""
+        """Time to read a frame, relative to the whole sensor without binning."""
         del mode
         return 1.0
 
@@ -95,10 +95,10 @@ class Simulation(ABC):
         """Compute, before a run, the values that all frames of a mode share."""
 
     def seen_by(self, camera: str) -> Simulation:
-        """What a camera receives that is a device of the profile, and not the camera of the atoms.
+        """The view of this simulation by a camera other than the camera of the atoms.
 
         Args:
-            camera: Name of the device.
+            camera: Name of the camera among the profile's devices.
 
         Returns:
             Its own view of this simulation, in which ``expose`` and the methods about the sensor differ.
@@ -111,25 +111,25 @@ class Simulation(ABC):
 
         Args:
             role: "camera" or "mobile_tweezers".
-            on_pulse: Called by the device that fires the lines, for all pulses of a program in order of time:
-                when the line switches on, on the session's clock, and how long it stays on, in seconds.
+            on_pulse: Called by the device that fires the lines, for all pulses of a program in order of time,
+                with the time of switching on, on the session's clock, and the duration, in seconds.
         """
 
     @property
     def loading_probability(self) -> float | None:
-        """Probability that a site holds an atom after loading, for estimates; None if unknown."""
+        """Probability that a site holds an atom after loading, for estimates. None if unknown."""
         return None
 
     def truth(self) -> Occupancy | None:
-        """The current true occupancy, bool (n_rows, n_cols), for the record; None if unknown."""
+        """The current true occupancy, bool (n_rows, n_cols), for the record. None if unknown."""
         return None
 
     def losses(self) -> Mapping[str, int]:
-        """Atoms lost since the shot began, for the record: cause -> number."""
+        """Atoms lost since the shot began, for the record, cause -> number."""
         return {}
 
     def atom_events(self, since_s: float) -> Mapping[str, NDArray[Any]]:
-        """Events of the shot, for the record: name -> structured array with a field for each column.
+        """Events of the shot, for the record, name -> structured array with a field for each column.
 
         Texts in a dtype's ``metadata={"descriptions": {column: text}}`` are written to the shot's file.
 
@@ -141,7 +141,7 @@ class Simulation(ABC):
 
 
 def loading_of(simulation: Simulation | None) -> float:
-    """Fraction of the sites that hold an atom after loading, as a simulation says, else as in the paper."""
+    """Fraction of the sites that hold an atom after loading, from the simulation or else from the paper."""
     simulated = None if simulation is None else simulation.loading_probability
     return PAPERS_LOADING if simulated is None else simulated
 
@@ -162,10 +162,9 @@ class ToneSource(Protocol):
     """The two outputs of a simulated device that drives the static tweezers."""
 
     def played(self, until_s: float) -> Sequence[TweezerAmplitudes]:
-        """The amplitudes of the tones since the last call, in order of time; empty if unchanged.
+        """The amplitudes of the tones since the last call, in order of time. Empty if unchanged.
 
-        Depth ramps are included: at half the depth the amplitudes of rows and columns are lower. They are 0
-        before the first call.
+        They include depth ramps, so they are lower at half the depth. They are 0 before the first call.
 
         Args:
             until_s: Time on the session's clock at which to stop for now.
@@ -178,7 +177,7 @@ class ReceivesOutput(Protocol):
     """A simulation that acts on the samples that a device outputs, not on the program it was given."""
 
     def warm(self) -> None:
-        """Compile the kernels for output samples; a driver with such outputs calls it in its own ``warm``."""
+        """Compile the kernels for output samples. A driver with such outputs calls it in its own ``warm``."""
         ...
 
     def connect_outputs(self, role: str, source: RfSource | ToneSource) -> None:

@@ -1,4 +1,4 @@
-"""The roles that plugins play, each declared once: its base class and its place among the devices."""
+"""The roles that plugins play, each with its base class and its place among the devices."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ class Role:
 
     Attributes:
         name: Its name in the registry, and in a profile or sequence.
-        base: Class of what the plugin's factory makes; a Protocol where any class with the methods will do.
+        base: Class of the objects from the plugin's factory. For a Protocol any class with the methods will
+            do.
         opens: Place in the order in which devices are opened.
         safe: Place in the order in which devices are made safe and closed.
         has_twin: Whether a dry run replaces it by the plugin called "virtual".
@@ -43,8 +44,8 @@ ROLES: Final[Mapping[str, Role]] = {
     role.name: role
     for role in (
         Role("planner", Planner),
-        # The static tweezers come first and go last, because they hold the atoms. The mobile tweezers are off
-        # before anything else is, because they could carry atoms away.
+        # The static tweezers open first and close last, because they hold the atoms. The mobile tweezers are
+        # switched off before anything else, because they could carry atoms away.
         Role("camera", Camera, opens=1, safe=3, has_twin=True),
         Role("static_tweezers", StaticTweezers, opens=0, safe=4, has_twin=True),
         Role("mobile_tweezers", MobileTweezers, opens=4, safe=0, has_twin=True),
@@ -62,7 +63,7 @@ ROLES: Final[Mapping[str, Role]] = {
 
 
 def in_opening_order(devices: Mapping[str, T]) -> list[tuple[str, T]]:
-    """Name and device, in the order of opening: static tweezers first, mobile tweezers last.
+    """Name and device, in the order of opening, with static tweezers first and mobile tweezers last.
 
     Args:
         devices: Role, or the user's name of a device -> device.
@@ -71,20 +72,20 @@ def in_opening_order(devices: Mapping[str, T]) -> list[tuple[str, T]]:
 
 
 def in_safe_order(devices: Mapping[str, T]) -> list[tuple[str, T]]:
-    """Name and device, in the order of the safe state: mobile tweezers first, static tweezers last."""
+    """Name and device, in the order of the safe state, mobile tweezers first and static tweezers last."""
     return sorted(devices.items(), key=lambda item: _role_of(item[0]).safe)
 
 
 def _role_of(name: str) -> Role:
-    """The role of a device of the profile; a camera among its ``devices`` counts as one of these."""
+    """The role of a device of the profile. A camera among its ``devices`` counts as a device."""
     role = ROLES.get(name)
     return role if role is not None and role.is_hardware else ROLES["device"]
 
 
 def overrides(part: object, ability: Callable[..., Any]) -> bool:
-    """Whether a driver has a version of its own of an optional ability.
+    """Whether a driver implements an optional ability.
 
-    For an ability whose default would cost a thread's wake-up in every shot, and for reports.
+    Used for abilities whose default would cost a thread's wake-up in every shot, and for reports.
 
     Args:
         part: The driver.

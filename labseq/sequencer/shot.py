@@ -382,7 +382,7 @@ class RunningShot:
     @property
     def _leaders(self) -> LeaderAnswers:
         if self.leaders is None:
-            raise ConfigError("the profile has no device through which another control system leads")
+            raise ConfigError("the profile has no device that receives signals of another control system")
         return self.leaders
 
     @property

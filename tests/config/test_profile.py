@@ -150,7 +150,7 @@ static_tweezers: => static_tweezer:
 camera: {use: virtual, readout: 5 ms}⏎ => ∅
   2:1: 'camera' is missing (the camera's plugin)
 camera: {use: virtual, readout: 5 ms} => camera: virtual
-  11:9: there is just 'virtual' here; expected a mapping; write '{use: virtual}'
+  11:9: there is only 'virtual' here; expected a mapping; write '{use: virtual}'
 rows: 20 => rows: 0
   5:9: rows is 0; expected at least 1
 4.49 um => 4.49 MHz
@@ -174,7 +174,7 @@ shutter: => camera:
 shutter: => my shutter:
   22:3: a device is called 'my shutter'; expected a word of letters, digits, '_' and '-' that begins with a letter
 shutter: {use: virtual} => shutter: virtual
-  22:12: there is just 'virtual' here; expected a mapping; write '{use: virtual}'
+  22:12: there is only 'virtual' here; expected a mapping; write '{use: virtual}'
 shutter: {use: virtual} => shutter: {us: virtual}
   22:12: 'use' is missing from 'shutter' (the name of a plugin); did you write 'us' for it?
 shutter: {use: virtual} => shutter: {use: virtual, role: camera, blinding: {}}

@@ -138,7 +138,7 @@ def test_analyses_have_their_place_and_their_time(tmp_path: Path) -> None:
     ("analyses", "message"),
     [
         ("survival", r":6:11: analysis is 'survival'; expected a list"),
-        ("[survival]", r":6:12: there is just 'survival' here; expected a mapping"),
+        ("[survival]", r":6:12: there is only 'survival' here; expected a mapping"),
         ("[{use: survival}, {use: survival}]", r":6:35: the analysis 'survival' is listed a second time"),
         ("[{use: sruvival}]", r":6:18: unknown analysis 'sruvival'.*did you mean 'survival'"),
         ("[{use: survival, atom: all}]", r":6:28: .*'atom'.*did you mean 'atoms'"),

@@ -144,7 +144,7 @@ record_frames: last => record_frames: lst
 [plugins, "more plugins"] => [plugins, 5]
   13:27: plugin_folders.1 is 5; expected text; put it in quotes
 target: {pattern: compact, rows: 15, cols: 15} => target: compact
-  7:9: there is just 'compact' here; expected a mapping; write '{pattern: compact}'
+  7:9: there is only 'compact' here; expected a mapping; write '{pattern: compact}'
 {pattern: compact => {patern: compact
   7:9: 'pattern' is missing from 'target' (the name of a target pattern); did you write 'patern' for it?
 use: psca⏎ => uses: psca⏎

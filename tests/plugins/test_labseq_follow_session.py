@@ -24,7 +24,7 @@ ANY_PORT = "profile.devices.leader.port=0"
 PATIENT = "profile.devices.leader.deadline=60 s"
 LOST = "profile.camera={use: virtual, readout: 5 ms, faults: {transient: 1.0}}"
 SMALL = "target={pattern: compact, rows: 3, cols: 3}"
-NO_LEADER = "follow.yaml:12:17: the profile has no device through which another control system leads"
+NO_LEADER = "follow.yaml:12:17: the profile has no device that receives signals of another control system"
 GUIDE = (ROOT / "docs" / "how-to" / "follow.md").read_text()
 PROGRAMS = re.findall(r"^```python\n(.*?)^```$", GUIDE, re.DOTALL | re.MULTILINE)
 
@@ -171,11 +171,11 @@ def test_a_second_wait_does_not_load_again(tmp_path: Path) -> None:
         (
             ["profile.devices={shutter: {use: virtual}}"],
             "off",
-            f"{NO_LEADER}; add one to its `devices`: `leader: {{use: tcp_leader}}`",
+            f"{NO_LEADER}; add `leader: {{use: tcp_leader}}` to its `devices`",
         ),
-        ([], "fast", "in a full dry run it says `go` itself, in a fast one it is missing"),
-        (["shot.0.wait.device=shutter"], "off", "no other control system leads through 'shutter'"),
-        (["shot.0.wait.device=artiq"], "off", "leads through 'artiq'; expected 'leader'"),
+        ([], "fast", "a full dry run simulates it and sends `go`, a fast dry run leaves it out"),
+        (["shot.0.wait.device=shutter"], "off", "'shutter' cannot receive signals of another control system"),
+        (["shot.0.wait.device=artiq"], "off", "'artiq' cannot receive signals of another control system; expected 'leader'"),
     ],
 )
 def test_who_cannot_lead_is_reported_before_anything_is_opened(
