@@ -1,1 +1,1 @@
-"""Nothing stays on: locks on devices, making them safe, and checking them one by one."""
+"""Locks devices, makes them safe so that nothing stays on, and checks them one by one."""

@@ -1,4 +1,4 @@
-"""`labseq devices`: open each device of a profile, identify and test it, make it safe, close it."""
+"""`labseq devices`, which opens, identifies, tests, makes safe and closes each device of a profile."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class CheckedDevice:
 
     Attributes:
         name: Its role, or its name in the profile.
-        described: The device's own description; empty if the check failed before it.
+        described: The device's own description. Empty if the check failed earlier.
         versions: See ``Hardware.versions``.
         unversioned: Why they could not be read, or None.
-        tested: Whether it passed its self test; False also if it has none.
-        latency_s: Time of a ``describe()``, from the call to the answer; None if the check failed before it.
-        constructed: Whether its plugin could construct it; if not, ``failure`` says why.
-        failure: Why it could not be opened, identified or tested, or what interrupted that; or None.
+        tested: Whether it passed its self test. False also if it has none.
+        latency_s: Time of a ``describe()``, from the call to the answer. None if the check failed earlier.
+        constructed: Whether its plugin could construct it. If not, ``failure`` says why.
+        failure: The error or interruption while opening, identifying or testing it, or None.
         unsafe: Why it is not in its safe state, or None.
         unclosed: Why it could not be closed, or None.
     """
@@ -85,12 +85,12 @@ class DevicesReport:
 def check_devices(profile: str, overrides: Sequence[str] = (), dry_run: DryRun = "off") -> DevicesReport:
     """Open each device of a profile in turn, identify and test it, make it safe and close it.
 
-    One that fails or hangs never keeps the others from being tried. After Ctrl-C the
-    current device is made safe and closed, and no other is opened.
+    If a device fails or hangs, the others are checked anyway. After Ctrl-C the current device is made safe
+    and closed, and no other is opened.
 
     Raises:
-        ConfigError: The profile has an error; no device was touched.
-        DeviceError: Another process uses the same real devices; none was touched.
+        ConfigError: The profile has an error. No device was touched.
+        DeviceError: Another process uses the same real devices. No device was touched.
     """
     check_dry_run(dry_run)
     hardware = resolve_profile(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
@@ -129,16 +129,17 @@ def check_each_device(
 ) -> list[CheckedDevice]:
     """Open, identify, test, make safe and close one device after the other.
 
-    The watchdog switches off what this process leaves on if it dies or hangs, or if the safe state fails.
+    The watchdog switches a device off if this process dies or hangs, or if the safe state fails.
 
     Args:
         devices: Name and device, in the order of opening.
-        stop: The request to stop: the current device is made safe and closed, the others are not opened.
-        simulation: The simulation that virtual devices act on: opened before them, closed after them.
+        stop: The request to stop, after which the current device is made safe and closed, and no other
+            opened.
+        simulation: The simulation that virtual devices act on. It is opened before and closed after them.
         warn: Receives warnings about the watchdog.
 
     Returns:
-        Those that were tried, the simulation first.
+        The checked devices, the simulation first.
     """
     guard, watchdog = Guard(stop), Watchdog("labseq devices", pulse=stop.pulse)
     tried: list[CheckedDevice] = []
@@ -184,7 +185,7 @@ def _examine_simulation(guard: Guard, simulation: Simulation, timeouts: Timeouts
 def _examine(
     guard: Guard, name: str, device: Hardware, timeouts: Timeouts, watchdog: Watchdog
 ) -> CheckedDevice:
-    """Open, identify and test a device; stops at the first failure."""
+    """Open, identify and test a device. Stops at the first failure."""
     checked = CheckedDevice(name)
     try:
         guard.call(name, WARM_S, device.warm)
@@ -198,7 +199,7 @@ def _examine(
         checked = _read_versions(guard, checked, device, timeouts.call_s)
         guard.call(name, timeouts.call_s, device.self_test)
         checked = replace(checked, tested=overrides(device, Hardware.self_test))
-        # the median, as the first one may be slow
+        # the median, as the first call may be slow
         readings_s = [_reading_s(guard, name, device, timeouts.call_s) for _ in range(N_READINGS)]
         return replace(checked, latency_s=statistics.median(readings_s))
     except LabseqError as failure:
@@ -206,7 +207,7 @@ def _examine(
 
 
 def _read_versions(guard: Guard, checked: CheckedDevice, device: Hardware, timeout_s: float) -> CheckedDevice:
-    """Read the versions of a device; a failure is noted, but does not mean that the device is faulty."""
+    """Read the versions of a device. A failure is noted, but does not mean that the device is faulty."""
 
     def versions() -> dict[str, tuple[str, str]]:
         return {

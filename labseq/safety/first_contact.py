@@ -1,4 +1,4 @@
-"""`labseq first-contact`: the steps in which a driver proves what it assumes, each of them ending safely."""
+"""`labseq first-contact`, whose steps check a driver's assumptions and each end in the safe state."""
 
 from __future__ import annotations
 
@@ -36,22 +36,22 @@ from labseq.sequencer.clock import RealClock, VirtualClock
 from labseq.sequencer.lab import attempt
 from labseq.watchdog import Watchdog
 
-NO_STEPS = "its driver offers no steps for a first contact: only identity, settings and limits were read"
+NO_STEPS = "its driver has no first-contact steps, so only identity, settings and limits were read"
 
 
 class Dialogue(Protocol):
-    """The user, who is asked before each step and reads the instruments; all outputs are off meanwhile."""
+    """The user, who is asked before each step and reads the instruments while all outputs are off."""
 
     def may_take(self, device: str, step: ContactStep, stop: StopFlag) -> bool:
-        """Whether to take a step; False also if its instrument is missing."""
+        """Whether to take a step. False also if its instrument is missing."""
         ...
 
     def reads(self, reading: Reading, stop: StopFlag) -> float | None:
-        """What the user reads from an instrument, in SI; None for nothing."""
+        """The number that the user reads from an instrument, in SI. None for nothing."""
         ...
 
     def ended(self, result: Mapping[str, Any]) -> None:
-        """A step has ended; its result has "failed" or "skipped" if it measured nothing."""
+        """A step has ended. Its result has "failed" or "skipped" if it measured nothing."""
         ...
 
     def written(self, contact: Contact) -> None:
@@ -66,7 +66,7 @@ class Contact:
     Attributes:
         device: Its name.
         path: The file that was written.
-        content: What is in it.
+        content: Content of the file.
         units: See :class:`labseq.roles.first_contact.FirstContact`.
         failed: Names of the steps that were taken and failed.
     """
@@ -80,11 +80,11 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What the user wants of a first contact.
+    """The user's choices for a first contact.
 
     Attributes:
-        role: The device; "" for all that are more than virtual.
-        steps: Only these steps; none: all. Steps that are not taken keep their earlier results.
+        role: The device. "" for all that are more than virtual.
+        steps: Only these steps, or all if empty. Steps that are not taken keep their earlier results.
         data: The data folder.
     """
 
@@ -107,8 +107,8 @@ def meet_devices(
         ConfigError: The profile has an error, there is no such device or step, or an earlier file does not
             belong to the device.
         DeviceError: A device cannot be opened, is another model, is in use, or is not safe after a step.
-        RecordingError: The data folder cannot be written; nothing was opened.
-        StopRequested: Ctrl-C; the device is safe, and the steps before that one are in its file.
+        RecordingError: The data folder cannot be written. Nothing was opened.
+        StopRequested: Ctrl-C. The device is safe, and the completed steps are in its file.
     """
     check_dry_run(dry_run)
     hardware = resolve_profile(profile, overrides=profile_overrides(overrides), dry_run=dry_run)
@@ -130,7 +130,7 @@ def meet_devices(
         contacts: list[Contact] = []
         for name, device in in_opening_order(constructed):
             if isinstance(device, OffersFirstContact):
-                # once more, without the simulation: what a simulator plays here is not meant for atoms
+                # again without the simulation, because a simulator's output here must not act on atoms
                 alone = replace(hardware, chosen={name: hardware.chosen[name]})
                 offer = construct_hardware(alone, clock)[0][name].first_contact()
                 meeting = _Meeting(name, offer, hardware, stop, dialogue, warn)
@@ -145,24 +145,24 @@ def meet_devices(
 
 
 def _names(hardware: ResolvedProfile, role: str) -> list[str]:
-    """The devices to meet: the one of this name, or all that are not virtual twins."""
+    """The devices to meet, either the named one or all that are not virtual twins."""
     devices = {name: choice for name, choice in hardware.chosen.items() if choice.entry.role.is_hardware}
     if role and role not in devices:
         what = f"the profile has no device '{role}'"
         raise ConfigError(Problem(what, str(hardware.document.path), expected=one_of(sorted(devices))))
     names = [name for name, choice in devices.items() if role in ("", name) and not choice.entry.virtual_time]
     if not names:
-        what = f"{role or 'every device of the profile'} is virtual: there is no device to meet"
-        hint = "name a driver's own simulator, or the device, with 'use:' in the profile"
+        what = f"{role or 'every device of the profile'} is virtual, so there is no device to meet"
+        hint = "choose a driver, with the device or its simulator, with 'use:' in the profile"
         raise ConfigError(Problem(what, str(hardware.document.path), hint=hint))
     return names
 
 
 def _check_writable(folder: Path) -> None:
-    """Make the folder and a file in it: readings of an oscilloscope are not taken twice.
+    """Check that the folder is writable, so that readings of an oscilloscope need not be taken twice.
 
     Raises:
-        RecordingError: One of them cannot be made.
+        RecordingError: The folder, or a file in it, cannot be made.
     """
     with explained(folder):
         make_folder(folder)
@@ -275,7 +275,7 @@ class _Meeting:
         earlier: Mapping[str, dict[str, Any]],
         taken: Mapping[str, dict[str, Any]],
     ) -> Contact:
-        """Judge and write what was measured, now and earlier."""
+        """Judge and write the measurements, including earlier ones."""
         contact, measured = self._contact, {**earlier, **taken}
         measured = {step.name: measured[step.name] for step in contact.steps if step.name in measured}
         content = _content(card, measured, contact.judge(measured), simulated=contact.is_simulated)
@@ -308,7 +308,7 @@ class _Meeting:
         return result
 
     def _end(self) -> tuple[LabseqError | None, LabseqError | None]:
-        """Make the device safe and close it; the watchdog switches off what could not be made safe."""
+        """Make the device safe and close it. If it is not safe, the watchdog switches it off."""
         with self._stop.held():  # a second Ctrl-C must not leave it on
             limit_s = self._timeouts.safe_state_s
             unsafe = attempt(self._guard, self._name, limit_s, self._contact.safe_state)
@@ -331,12 +331,12 @@ def _chosen(steps: Sequence[ContactStep], names: Sequence[str]) -> list[ContactS
 
 
 def _earlier(path: Path, card: Mapping[str, Any], *, must_belong: bool) -> dict[str, Any]:
-    """The results of an earlier first contact with the same card on this computer; none without a file.
+    """The results of an earlier first contact with the same card on this computer. Empty without a file.
 
     Args:
         path: The file.
-        card: What the device is.
-        must_belong: Whether to refuse a file that is not about it, instead of beginning a new one.
+        card: The identity of the device.
+        must_belong: Whether to refuse a file about another card, instead of beginning a new one.
 
     Raises:
         ConfigError: The file was edited, or is about another card, driver, firmware or computer.

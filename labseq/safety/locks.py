@@ -1,4 +1,4 @@
-"""Locks of the devices of a profile: one process at a time uses them."""
+"""Locks on the devices of a profile, so that only one process at a time uses them."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ def lock_devices(
 ) -> Generator[Callable[[str], None]]:
     """Lock a profile's devices against other processes within the block.
 
-    A lock ends with its process, also if that is killed. Simulated devices are not locked.
+    A lock ends with its process, even if that is killed. Simulated devices are not locked.
 
     Args:
         purpose: The use of the devices, shown to other users while they are locked.
         warn: Receives a warning if a device cannot be locked.
-        blocked: Called with device and holder if another process has locked it; returns whether to try
-            again. Without it that is an error.
+        blocked: Called with device and holder if another process has locked it. Returns whether to try again.
+            Without it that is an error.
 
     Yields:
-        A function that changes this description of their use.
+        A function that changes ``purpose``.
 
     Raises:
-        DeviceError: Another process holds a device; names both.
+        DeviceError: Another process holds a device. The message names both.
     """
     locks: list[Lock] = []
     with ExitStack() as stack:
@@ -51,9 +51,9 @@ def lock_devices(
                     make_shared(lock.path.parent)
                     holder = lock.take()
                 except OSError as error:
-                    # a folder without locks must not keep anybody from working, nor from `labseq safe`
+                    # a folder without locks must not prevent work, and not `labseq safe` either
                     text = f"{lock.path} cannot be locked: {error.strerror or error}"
-                    warn(f"{text}: nothing keeps another process from {device}")
+                    warn(f"{text}; another process could use {device} at the same time")
                     break
                 if holder is None:
                     stack.callback(lock.release)
@@ -76,7 +76,7 @@ def lock_devices(
 
 @contextmanager
 def _beating(locks: Sequence[Lock]) -> Generator[None]:
-    """Give signs of life from a thread of its own, which stops only if the whole interpreter does."""
+    """Give signs of life from a separate thread, which stops only if the whole interpreter does."""
     ended = threading.Event()
 
     def beat() -> None:
@@ -93,5 +93,5 @@ def _beating(locks: Sequence[Lock]) -> Generator[None]:
 
 
 def device_text(role: str, identity: str) -> str:
-    """A device with what identifies it, for the user."""
+    """A device with its identity, for the user."""
     return role if identity.startswith(f"{role} ") else f"{role} ({identity})"

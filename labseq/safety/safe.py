@@ -1,4 +1,4 @@
-"""`labseq safe`, also `--stand-by`, and what a run does after one that died: make each device safe."""
+"""Makes each device safe, for `labseq safe`, its `--stand-by`, and a run after a run that died."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class SafeStateReport:
 
     @property
     def failures(self) -> list[LabseqError]:
-        """Why devices are not safe, those that were tried first; empty if all are."""
+        """Why devices are not safe, tried devices before refused ones. Empty if all are safe."""
         return [error for error in [*self.attempted.values(), *self.refused.values()] if error is not None]
 
 
@@ -71,9 +71,9 @@ def make_each_safe(
     simulation: Simulation | None = None,
     observer: RunObserver | None = None,
 ) -> dict[str, LabseqError | None]:
-    """Open, make safe and close each device; one that fails never stops the others.
+    """Open, make safe and close each device, even if others fail.
 
-    The watchdog switches off what this process leaves on if it dies or hangs, or if the safe state fails.
+    The watchdog switches a device off if this process dies or hangs, or if the safe state fails.
 
     Args:
         devices: Name and device, in the order of the safe state.
@@ -115,7 +115,7 @@ def warn(observer: RunObserver | None, text: str) -> None:
 
 
 def report_outcome(observer: RunObserver | None, event: str, name: str, failure: LabseqError | None) -> None:
-    """Report the outcome of a device; a screen that fails must not keep the next one from being made safe."""
+    """Report the outcome of a device. Errors are ignored, so that the next device is made safe anyway."""
     if observer is not None:
         with suppress(BaseException):
             observer.event(event, {"device": name, "ok": failure is None, "error": str(failure or "")})
@@ -124,10 +124,10 @@ def report_outcome(observer: RunObserver | None, event: str, name: str, failure:
 def construct_hardware(
     hardware: ResolvedProfile, clock: Clock
 ) -> tuple[dict[str, Any], dict[str, LabseqError]]:
-    """Construct the devices of a profile, and the simulation if there is one; nothing is opened.
+    """Construct the devices of a profile, and the simulation if there is one, without opening them.
 
     Returns:
-        Role or device name -> object; and name -> why it could not be constructed, with its place.
+        Role or device name -> object, and name -> why it could not be constructed, with its place.
     """
     plugin_choices = {role: choice for role, choice in hardware.chosen.items() if choice.entry.role.has_twin}
     failures: dict[str, LabseqError] = {}
@@ -141,17 +141,17 @@ def make_profile_devices_safe(
 ) -> SafeStateReport:
     """Construct each device of a profile, open it, make it safe and close it.
 
-    A device that cannot be constructed does not affect the others; it is reported at the end.
+    A device that cannot be constructed does not affect the others. It is reported at the end.
 
     Args:
-        stop: The request to stop; not obeyed here.
+        stop: The request to stop, which is not obeyed here.
     """
     clock = VirtualClock(stop) if hardware.virtual_time else RealClock(stop)
     devices, failures = construct_hardware(hardware, clock)
     simulation = devices.pop("simulation", None)
     with stop.held():
         attempted = make_each_safe(in_safe_order(devices), hardware.profile.timeouts, simulation, observer)
-    # a detector is no device: nothing stays on if it cannot be constructed
+    # a detector is not a device, so nothing stays on if it cannot be constructed
     refused: dict[str, LabseqError] = {
         role: error for role, error in hardware.refused.items() if role != "detector"
     }
@@ -164,12 +164,12 @@ def make_profile_devices_safe(
 def make_safe_after_crash(
     dead: Path, hardware: ResolvedProfile, stop: StopFlag, observer: RunObserver
 ) -> None:
-    """Make the devices of a profile safe after the process of their last run died: they may still be on.
+    """Make the devices of a profile safe after their last run died, because they may still be on.
 
     Args:
         dead: The folder of that run.
         hardware: The profile.
-        stop: The request to stop; obeyed once every device has been tried.
+        stop: The request to stop, obeyed once every device has been tried.
         observer: Receives warnings.
 
     Raises:
@@ -199,16 +199,16 @@ def make_profile_safe(
 ) -> SafeStateReport:
     """Bring every device of a profile to its safe state.
 
-    Another process that uses them is ended first: most devices cannot be opened twice, and a run would switch
-    them on again. Ctrl-C is obeyed once every device has been tried. If all devices are safe, the next run
-    need not make them safe, however the last one ended.
+    Another process that uses them is ended first, because most devices cannot be opened twice, and a run
+    would switch them on again. Ctrl-C is obeyed once every device has been tried. If all devices are safe,
+    the next run need not make them safe, however the last run ended.
 
     Args:
-        may_end: Asked whether to end a process that does not hang; receives which device it uses. If it must
-            not be ended, the devices are made safe anyway, as far as that is possible.
+        may_end: Called with the device in use, returns whether to end a process that does not hang. If it
+            must not be ended, the devices are made safe anyway, as far as that is possible.
 
     Raises:
-        ConfigError: The profile cannot be read, or does not exist; no device was touched.
+        ConfigError: The profile cannot be read, or does not exist. No device was touched.
         StopRequested: Ctrl-C or SIGTERM came meanwhile.
     """
     problems, stop, to_user = ProblemCollector(), StopFlag(), partial(warn, observer)
@@ -232,20 +232,20 @@ def make_profile_safe(
 
 
 def read_devices(profile: str, overrides: Sequence[str], problems: ProblemCollector) -> ResolvedProfile:
-    """Read a profile and choose its devices; errors are tolerated as long as some devices are usable."""
+    """Read a profile and choose its devices. Errors are tolerated as long as some devices are usable."""
     for_profile = profile_overrides(overrides)
     document, spec = load_profile(profile, overrides=for_profile, problems=problems)
     with problems:
         plugin_paths(document, spec.plugin_folders)
     folders: list[Path] = []
     for folder in spec.plugin_folders:
-        with suppress(ConfigError):  # reported already; the other folders may have the devices' plugins
+        with suppress(ConfigError):  # reported already, and other folders may have the devices' plugins
             folders += plugin_paths(document, [folder])
     return choose_plugins(document, spec, load_plugins(folders, spec.timeouts.load_s), "off", problems)
 
 
 FIRST_S: Final = 0.5
-"""Head start for the watchdog of a run, which is faster and may still be there."""
+"""Head start for the watchdog of a run, which is faster and may still be running."""
 
 
 def stand_by(
@@ -254,9 +254,9 @@ def stand_by(
     observer: RunObserver | None = None,
     announce: Callable[[str], object] = str,
 ) -> None:
-    """Make devices safe when a process that uses them dies without having done so, or hangs; until Ctrl-C.
+    """Until Ctrl-C, make devices safe when a process that uses them hangs, or dies and leaves them on.
 
-    The locks of the devices say which process that is; devices that other processes use are left alone.
+    The locks of the devices tell the process. Devices that other processes use are left alone.
 
     Args:
         announce: Receives the devices at the beginning, then each process that died or hangs.
@@ -270,7 +270,7 @@ def stand_by(
         raise ConfigError(problems.problems)
     identities = hardware.identities
     if not identities:
-        text = "all of its devices are simulated, and those are not locked; there is nothing to stand by for"
+        text = "all its devices are simulated and thus not locked, so there is nothing to stand by for"
         raise ConfigError(f"{hardware.document.path}: {text}")
     devices = ", ".join(device_text(role, identity) for identity, role in identities.items())
     watch = _DeviceWatch(identities)
@@ -289,15 +289,15 @@ def stand_by(
 def _secure(
     profile: ResolvedProfile, role: str, stop: StopFlag, watch: _DeviceWatch, observer: RunObserver | None
 ) -> None:
-    """Make one device safe, and try again for a while, unless a process that works has begun to use it."""
+    """Make one device safe, with retries for a while, unless a working process has begun to use it."""
     hardware = replace(profile, chosen={role: profile.chosen[role]})
     to_user, deadline_s = partial(warn, observer), time.monotonic() + TRY_AGAIN_S
-    # a process that works is never ended
+    # a working process is never ended
     ends = end_holders(str(profile.document.path), to_user, lambda _: False)
 
     def blocked(device: str, holder: Holder) -> bool:
         if not watch.is_in_trouble(holder):
-            raise DeviceError(role, f"in use by {holder}, and left alone")
+            raise DeviceError(role, f"left alone, because it is in use by {holder}")
         return ends(device, holder)
 
     try:
@@ -317,7 +317,7 @@ class _DeviceWatch:
     """Finds processes that died or hang while they use devices.
 
     Args:
-        identities: What identifies each device -> its role.
+        identities: Identity of each device -> its role.
     """
 
     def __init__(self, identities: Mapping[str, str]) -> None:
@@ -326,7 +326,7 @@ class _DeviceWatch:
         self._seen: set[Process | None] = set()
 
     def new_troubles(self) -> list[tuple[Holder, list[str]]]:
-        """Each such process, once, and its devices in the order of the safe state."""
+        """Each such process, reported once, with its devices in the order of the safe state."""
         troubles: dict[Holder, dict[str, None]] = {}
         for identity, role in self._identities.items():
             holder = Lock(lock_file(identity), "").holder()
@@ -355,8 +355,8 @@ def end_holders(
 
     Args:
         profile: The profile, as it is named in commands.
-        warn: Receives a line for each thing that is done.
-        may_end: Asked whether to end a process that does not hang; receives which device it uses.
+        warn: Receives a line for each action.
+        may_end: Called with the device in use, returns whether to end a process that does not hang.
     """
     tried = set[Process | None]()
 
@@ -364,7 +364,7 @@ def end_holders(
         process, text = holder.process, f"{device} is in use by {holder}"
         if process in tried:
             return False
-        tried.add(process)  # once: it is not killed again if it still holds the next device
+        tried.add(process)  # only once, even if it still holds the next device
         is_other = process is not None and process.is_here and process.pid != os.getpid()
         if process is None or not is_other or not (holder.hangs or may_end(text)):
             hint = f"; 'labseq safe {profile} --end' ends that process first" if is_other else ""

@@ -1,4 +1,4 @@
-"""The session's time: real, virtual, or virtual at the speed of real time."""
+"""The session's time, which is real, virtual, or virtual at the speed of real time."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Final
 from labseq.guard import StopFlag
 
 SLEPT: Final = "computer.slept_s"
-"""Reading of a shot before whose end the computer was suspended: for how long, since the shot before."""
+"""Reading with the time for which the computer was suspended since the previous shot."""
 CLOCK_SET: Final = "computer.clock_set_s"
-"""Reading of a shot before whose end the computer's clock was set: by how much; where a system does not say
-that it slept, this is the sum of both."""
+"""Reading with the amount by which the computer's clock was set since the previous shot. It includes the time
+asleep on systems that do not report it."""
 
 
 class RealClock:
@@ -28,7 +28,7 @@ class RealClock:
         return time.monotonic()
 
     def sleep(self, duration_s: float) -> None:
-        """Wait; raises ``StopRequested`` at once when the run is asked to stop."""
+        """Wait. Raises ``StopRequested`` at once when the run is asked to stop."""
         self._stop.wait(duration_s)
 
     def check(self) -> None:
@@ -50,7 +50,7 @@ class VirtualClock:
         return self._now_s
 
     def sleep(self, duration_s: float) -> None:
-        """Advance virtual time; raises ``StopRequested`` if the run was asked to stop."""
+        """Advance virtual time. Raises ``StopRequested`` if the run was asked to stop."""
         self._stop.check()
         self._now_s += max(0.0, duration_s)
 
@@ -69,7 +69,7 @@ class PacedClock(VirtualClock):
 
 
 def _boot_s() -> float:
-    """A clock that goes on while the computer sleeps; that of Linux alone is compared with one that stops."""
+    """A clock that runs while the computer sleeps. Only on Linux is it another clock than ``monotonic``."""
     number = getattr(time, "CLOCK_BOOTTIME", None)
     return time.monotonic() if number is None else time.clock_gettime(number)
 
@@ -93,13 +93,13 @@ class ClockJumps:
         self._ahead_s = self._now()
 
     def since_last(self) -> dict[str, float]:
-        """What happened since the last call, as readings of a shot; less than 1 s is drift of the clock."""
+        """Jumps since the last call, as readings of a shot. Less than 1 s is drift of the clock."""
         before, self._ahead_s = self._ahead_s, self._now()
         slept_s, jumped_s = (now - then for now, then in zip(self._ahead_s, before, strict=True))
         jumps = {SLEPT: slept_s, CLOCK_SET: jumped_s - slept_s}
         return {name: round(jump_s, 3) for name, jump_s in jumps.items() if abs(jump_s) >= 1.0}
 
     def _now(self) -> tuple[float, float]:
-        """By how much the clocks of sleep and of the wall are ahead of the one that stops."""
+        """Lead of the clock that runs in sleep, and of the wall clock, over the clock that stops in sleep."""
         wall_s, monotonic_s, boot_s = (clock() for clock in self._clocks)
         return boot_s - monotonic_s, wall_s - monotonic_s

@@ -1,4 +1,4 @@
-"""The camera's series: armed once for the images of a shot that are alike."""
+"""The camera's series, armed once for consecutive images with the same exposure time."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ def take_frame(
     max_wait_s: float,
     light: AbstractContextManager[object],
 ) -> Frame:
-    """Take one frame with a camera, armed for it alone.
+    """Take one frame with a camera, armed for this frame only.
 
     Args:
         exposure_s: Exposure time, in seconds.
-        call: Calls a device: ``call(name, timeout_s, function, *arguments)``.
+        call: Calls a device, as ``call(name, timeout_s, function, *arguments)``.
         max_wait_s: Longest time of a call beyond the exposure, in seconds.
         light: Entered before the exposure, once the camera is ready, and left after the frame has come.
 
     Raises:
-        DeviceError: It has an EM gain, only an external trigger, or returned something else than a frame.
+        DeviceError: The camera has an EM gain, only an external trigger, or did not return a frame.
     """
     facts = camera.facts
     if facts.em_gain > 1:
-        text = f"no frame of other light than that of atoms with an EM gain of {facts.em_gain:g}"
-        raise DeviceError(name, f"{text}: it would age the EM register; set `em_gain` of this camera to 1")
+        text = f"with an EM gain of {facts.em_gain:g} light other than the atoms' would age the EM register"
+        raise DeviceError(name, f"{text}; set `em_gain` of this camera to 1")
     own: tuple[Trigger, ...] = ("software", "internal")
     trigger = next((one for one in own if one in facts.triggers), None)
     if trigger is None:
@@ -52,16 +52,16 @@ def take_frame(
         if trigger == "software":
             call(name, limit_s, camera.trigger)
         else:
-            arm()  # only now: the internal trigger starts the exposure at once
+            arm()  # only now, because the internal trigger starts the exposure at once
         frame = call(name, limit_s + DRIVER_MARGIN_S, camera.read, limit_s)
     return as_frame(name, frame)
 
 
 def as_frame(name: str, frame: object) -> Frame:
-    """What a camera's ``read()`` returned.
+    """Check the object that a camera's ``read()`` returned.
 
     Raises:
-        DeviceError: It is something else than a frame.
+        DeviceError: It is not a frame.
     """
     if not isinstance(frame, Frame):
         raise DeviceError(name, f"read() returned {type(frame).__name__}; expected a Frame")
@@ -92,19 +92,19 @@ def with_waits(
 
 
 class CameraSeries:
-    """Arms the camera for as many images of a shot as have the same exposure time.
+    """Arms the camera once for consecutive images of a shot with the same exposure time.
 
-    A camera with EM gain is disarmed wherever light may be on that harms it, because it clears its sensor
-    through the EM register between exposures as well.
+    A camera with EM gain is disarmed whenever harmful light may be on, because it clears its sensor through
+    the EM register between exposures as well.
 
     Args:
         call: Calls the camera within the time limit of a call.
 
     Attributes:
-        timelines: The timeline of each step of the shot; without one, each image is armed for on its own.
+        timelines: The timeline of each step of the shot. Without them, each image is armed for on its own.
         by_line: Whether a line of the timing box triggers the camera.
-        cycle_s: Time from one exposure to the next if the camera starts them by itself, in seconds; else 0.
-        fire_s: When the lines must be fired for such an exposure, on the session's clock; nan for none.
+        cycle_s: Time from one exposure to the next if the camera starts them by itself, in seconds. Else 0.
+        fire_s: When the lines must be fired for such an exposure, on the session's clock. nan for none.
         arm_s: Time that arming takes, in seconds.
     """
 
@@ -123,11 +123,11 @@ class CameraSeries:
         self.fire_s = math.nan
 
     def entries(self, number: int) -> Sequence[TimelineEntry]:
-        """The timeline of a step; empty if it is not known."""
+        """The timeline of a step, empty if it is not known."""
         return self.timelines[number] if number < len(self.timelines) else ()
 
     def begin_step(self, number: int) -> None:
-        """Begin a step: disarm the camera if light of this step may harm it."""
+        """Begin a step. Disarm the camera if light of this step may harm it."""
         self._step, self._n_taken = number, 0
         if any(self._may_blind(entry) for entry in self.entries(number)):
             self.end()
@@ -137,15 +137,15 @@ class CameraSeries:
         return self._n_left > 0 and exposure_s == self._exposure_s
 
     def arm(self, exposure_s: float) -> None:
-        """Arm for an image and those like it that follow."""
+        """Arm for an image and the images after it that have the same exposure time."""
         n_frames = 1 if self._is_lit_between else max(1, sum(self._alike(exposure_s)))
         self._n_left, self._is_armed, self.fire_s = 0, True, math.nan
         self._call(self._camera.arm, n_frames, exposure_s, self._trigger)
         self._n_left, self._exposure_s = n_frames, exposure_s
 
     def taken(self, fired_s: float) -> None:
-        """Count an image; ``fired_s`` is when the lines were fired for it, on the session's clock."""
-        if self.cycle_s:  # counted from the first edge, as the camera does: labseq's own delays do not add up
+        """Count an image. ``fired_s`` is when the lines were fired for it, on the session's clock."""
+        if self.cycle_s:  # counted from the first edge, as the camera does, so that delays do not add up
             self.fire_s = self.cycle_s + (fired_s if math.isnan(self.fire_s) else self.fire_s)
         self._n_left, self._n_taken = self._n_left - 1, self._n_taken + 1
         if self._is_lit_between:
@@ -158,11 +158,11 @@ class CameraSeries:
         self.forget()
 
     def forget(self) -> None:
-        """The camera was made safe, and the step begins again."""
+        """Forget the series, because the camera was made safe and the step begins again."""
         self._is_armed, self._n_left, self._n_taken = False, 0, 0
 
     def _alike(self, exposure_s: float) -> Iterator[int]:
-        """Numbers of the images to come, as long as they are alike and no light may harm the camera."""
+        """Numbers of the next images, up to another exposure time or light that may harm the camera."""
         n_before = self._n_taken
         for number in range(self._step, len(self.timelines)):
             for entry in self.timelines[number]:

@@ -1,4 +1,4 @@
-"""The devices of a run: their order, their safe state and how they are closed."""
+"""The devices of a run, their order, their safe state and how they are closed."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ def check_blinding(lab: Lab, guard: Guard) -> None:
     """Raise before an exposure with EM gain if light is on that would age or destroy the EM register.
 
     Raises:
-        DeviceError: Such a light is on; nothing was exposed.
+        DeviceError: Such a light is on. Nothing was exposed.
     """
     em_gain = lab.camera.facts.em_gain
     if em_gain <= 1.0:
         return
     if lines := blinding_lines(lab.line_specs, "image"):
-        text = f"no exposure with an EM gain of {em_gain:g}: the line '{lines[0]}' is on during `image`"
-        raise DeviceError(
-            "camera", f"{text}, and the profile marks it as blinding; take `image` out of its `on`"
-        )
+        text = f"no exposure with an EM gain of {em_gain:g} while '{lines[0]}' is on, which the profile marks"
+        raise DeviceError("camera", f"{text} as blinding; remove `image` from the `on` of this line")
     for name, state in _on(lab, lab.blinding, guard).items():
         text = f"no exposure with an EM gain of {em_gain:g} while '{name}' is on (its value is {state!r})"
-        raise DeviceError("camera", f"{text}; the profile marks it as blinding: turn it off before the image")
+        raise DeviceError(
+            "camera", f"{text}, as the profile marks it as blinding; turn it off before the image"
+        )
 
 
 def _on(lab: Lab, marks: Mapping[str, Blinding], guard: Guard) -> dict[str, Any]:
@@ -73,7 +73,7 @@ class Lab:
     """Devices, planner, detector, clock and settings that a shot uses.
 
     Attributes:
-        budgets: Budgets of stages that do not have their own: stage -> seconds.
+        budgets: Budgets of stages that do not have their own, stage -> seconds.
         camera_is_simulated: Whether the camera sees the simulated atoms, so that their truth is recorded.
     """
 
@@ -138,9 +138,9 @@ class Lab:
 
 
 Emit = Callable[[str, Mapping[str, Any]], None]
-"""Receives an event: name and values."""
+"""Receives an event as name and values."""
 Outcome = dict[str, LabseqError | None]
-"""Device name -> its failure, or None; in the order of the calls."""
+"""Device name -> its failure, or None, in the order of the calls."""
 
 
 NEXT_S: Final = 0.2
@@ -148,13 +148,13 @@ NEXT_S: Final = 0.2
 
 
 def end_safely(lab: Lab, guard: Guard) -> tuple[Outcome, dict[str, float]]:
-    """Bring every device to its safe state; one that takes long does not delay the others.
+    """Bring every device to its safe state. A slow device does not delay the others.
 
-    They begin in the order of the safe state. This is for the end of a run: devices that act at the same time
-    need not give the same data as in turn.
+    They begin in the order of the safe state. This is only for the end of a run, because devices that act at
+    the same time need not give the same data as in turn.
 
     Returns:
-        The outcome; and after how many seconds each device was safe.
+        The outcome, and after how many seconds each device was safe.
     """
     begun_s = time.monotonic()
     results: dict[str, Callable[[], object]] = {}
@@ -173,7 +173,7 @@ def end_safely(lab: Lab, guard: Guard) -> tuple[Outcome, dict[str, float]]:
 
 
 def make_safe(lab: Lab, guard: Guard, names: Container[str] | None = None) -> Outcome:
-    """Bring every device, or those of these names, to its safe state; no failure stops the others.
+    """Bring every device, or the named devices, to its safe state. No failure stops the others.
 
     Each device has its own timeout.
     """
@@ -182,7 +182,7 @@ def make_safe(lab: Lab, guard: Guard, names: Container[str] | None = None) -> Ou
 
 
 def close_all(lab: Lab, guard: Guard, names: Container[str] | None = None) -> Outcome:
-    """Close every device in the safe order, then the simulation; or those of these names."""
+    """Close every device in the safe order, then the simulation, or only the named ones."""
     methods = {name: device.close for name, device in lab.safe_order()}
     if lab.simulation is not None:
         methods["simulation"] = lab.simulation.close
@@ -195,7 +195,7 @@ def _each(
     timeout_s: float,
     names: Container[str] | None,
 ) -> Outcome:
-    """Call the methods in their order; those of these names, if names are given."""
+    """Call the methods in their order, or only the named ones if names are given."""
     return {
         name: attempt(guard, name, timeout_s, method)
         for name, method in methods.items()
@@ -204,18 +204,18 @@ def _each(
 
 
 def attempt(guard: Guard, name: str, timeout_s: float, method: Callable[[], object]) -> LabseqError | None:
-    """Call a method of a device even if the run is asked to stop; returns why it failed, or None."""
+    """Call a method of a device even if the run is asked to stop. Returns why it failed, or None."""
     act = partial(guard.call_despite_stop, name, timeout_s, method)
     return failure_of(name, f"{method.__name__}()", act)
 
 
 def failure_of(name: str, what: str, act: Callable[[], object]) -> LabseqError | None:
-    """Do something with a device; returns why it failed, or None."""
+    """Call a function for a device. Returns why it failed, or None."""
     try:
         act()
     except LabseqError as failure:
         return failure
-    except BaseException as failure:  # noqa: BLE001 - Ctrl-C where it has no handler: the others come first
+    except BaseException as failure:  # noqa: BLE001 - even after an unhandled Ctrl-C the others come first
         return DeviceError(name, f"{what} was interrupted by {format_error(failure)}")
     return None
 
@@ -223,9 +223,9 @@ def failure_of(name: str, what: str, act: Callable[[], object]) -> LabseqError |
 def open_device(
     guard: Guard, name: str, device: Hardware, timeout_s: float, watchdog: Watchdog, order: int
 ) -> None:
-    """Open a device, even if the run is asked to stop; the watchdog learns how it is switched off.
+    """Open a device, even if the run is asked to stop. The watchdog learns how it is switched off.
 
-    A slow ``open()`` must end first: its last actions would undo the safe state.
+    A slow ``open()`` must end first, because its last actions would undo the safe state.
 
     Raises:
         LabseqError: It cannot be opened, or ``emergency()`` fails.
@@ -237,7 +237,7 @@ def open_device(
 
 
 def describe(lab: Lab, guard: Guard) -> dict[str, Mapping[str, Any]]:
-    """The description of each device: name -> JSON-ready values."""
+    """The description of each device, name -> JSON-ready values."""
     parts: dict[str, Hardware | Simulation] = dict(lab.hardware())
     if lab.simulation is not None:
         parts["simulation"] = lab.simulation

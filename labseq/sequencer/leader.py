@@ -1,4 +1,4 @@
-"""Runs started by another control system: wait for its start signal, and answer with the outcome."""
+"""Waits for the start signal of another control system, and answers with the outcome of the shot."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class LeaderAnswers:
     Attributes:
         shot: The shot.
         guard: Runs every call into the devices.
-        emit: Receives every event: name and values.
-        place: Where the shot will be recorded if it counts: "run" and "file"; empty if nowhere.
-        settings_for: The settings of a shot with values of the other system; None if it may set none.
+        emit: Receives every event as name and values.
+        place: "run" and "file" where the shot will be recorded if it counts. Empty if nowhere.
+        settings_for: The settings of a shot with values of the other system. None if it may set none.
     """
 
     shot: RunningShot
@@ -43,14 +43,14 @@ class LeaderAnswers:
     _values: dict[str, str] = field(default_factory=dict[str, str])
 
     def __post_init__(self) -> None:
-        """Find the devices that carry more than edges, and let them check values that come early."""
+        """Find the devices that carry more than start signals, and let them check values that come early."""
         devices = self.shot.lab.hardware()
         self._dialogues |= {name: device for name, device in devices if isinstance(device, LeaderDialogue)}
         for dialogue in self._dialogues.values():
             dialogue.expect_values(self._check)
 
     def follow(self, signal: str, timeout_s: float, device: str) -> None:
-        """Wait for a signal; see ``labseq.plugin.Shot.follow``."""
+        """Wait for a signal. See ``labseq.plugin.Shot.follow``."""
         name, leader = find_leader(dict(self.shot.lab.hardware()), device)
         self._answer(name, leader, "ready", self.guard.call)  # the answer to an earlier signal in this shot
         awaited = {"shot": self.shot.index, "device": name, "signal": signal, "timeout_s": timeout_s}
@@ -75,7 +75,7 @@ class LeaderAnswers:
         """Give the rest of the shot the values that the other system has sent.
 
         Raises:
-            ConfigError: One is wrong; the shot is as it was before.
+            ConfigError: A value is wrong. The shot is unchanged.
         """
         values = dict(self._values)
         for name, dialogue in self._dialogues.items():
@@ -92,16 +92,16 @@ class LeaderAnswers:
         """The settings with these values.
 
         Raises:
-            ConfigError: One is wrong, or the sequence does not allow it.
+            ConfigError: A value is wrong, or the sequence does not allow it.
         """
         if self.settings_for is None:
             address = next(iter(values))
             what = f"the sequence does not let the leader set '{address}'"
-            raise ConfigError(f"{what}; write 'leader: {{may_set: [{address}]}}' in it")
+            raise ConfigError(f"{what}; add 'leader: {{may_set: [{address}]}}' to it")
         return self.settings_for(values)
 
     def take_turn(self, step: str, timeout_s: float, device: str) -> None:
-        """Let the other system do a step of its own; see ``labseq.plugin.Shot.leave_to_leader``."""
+        """Let the other system do a step of its own. See ``labseq.plugin.Shot.leave_to_leader``."""
         name, leader = self._dialogue(device)
         limit_s, shot = timeout_s + DRIVER_MARGIN_S, self.shot
         self._log("leader_turn", name, step)
@@ -112,7 +112,7 @@ class LeaderAnswers:
         self._record(f"{name}.{step}", text)
 
     def image(self, image: ImageRecord) -> None:
-        """Tell an image as soon as it is known, to a system that has asked for each."""
+        """Send an image, as soon as it is known, to systems that have asked for images."""
         shot = self.shot
         about = {"shot": shot.index, "image": image, "target": shot.target, "start_s": shot.start_s}
         for name, dialogue in self._dialogues.items():
@@ -136,13 +136,13 @@ class LeaderAnswers:
 
         Raises:
             DeviceError: A device fails.
-            StopRequested: The run was asked to stop; the caller must answer "failed".
+            StopRequested: The run was asked to stop. The caller must answer "failed".
         """
         for name, leader in leaders(dict(self.shot.lab.hardware())):
             self._answer(name, leader, "ready", self.guard.call)
 
     def failed(self, error: BaseException, emit: Emit) -> None:
-        """Answer "failed" with a reason; a device that cannot is a warning."""
+        """Answer "failed" with a reason. A device that cannot answer causes a warning."""
         reason, self.emit = error_text(error) or type(error).__name__, emit
         for name, leader in leaders(dict(self.shot.lab.hardware())):
             try:
@@ -176,16 +176,16 @@ class LeaderAnswers:
         self._log_events(name, leader)
 
     def _dialogue(self, device: str) -> tuple[str, LeaderDialogue]:
-        """The device through which the other system is asked; "" for the only one.
+        """The device that connects to the other system. "" for the only one.
 
         Raises:
-            ConfigError: There is none of that name, or several.
+            ConfigError: There is no such device, or there are several.
         """
         found = {name: leader for name, leader in self._dialogues.items() if device in ("", name)}
         if len(found) != 1:
             names = ", ".join(self._dialogues) or "none"
             raise ConfigError(
-                f"a step of the leader needs one device that it speaks through; there is {names}"
+                f"a step of the leader needs exactly one device that connects to it; there is {names}"
             )
         return next(iter(found.items()))
 

@@ -1,4 +1,4 @@
-"""When each line is on in a whole shot, which `labseq check` draws; a run does not need it."""
+"""When each line is on in a whole shot, for the picture of `labseq check`. A run does not need it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def spans_on(
         bars: The shot's timeline.
 
     Returns:
-        Name -> (start, end) of each time that it is on, in seconds from the start of the shot; without lines
-        that only pulses turn on, if none does.
+        Name -> (start, end) of each time that it is on, in seconds from the start of the shot. Lines that
+        only pulses turn on are left out if there is no such pulse.
     """
     found: dict[str, list[tuple[float, float]]] = {spec.name: [] for spec in specs}
     start_s = 0.0
@@ -40,7 +40,7 @@ def spans_on(
 
 
 def _join(spans: list[tuple[float, float]], more: Iterable[tuple[float, float]]) -> None:
-    """Add spans in order of time; spans that touch become one."""
+    """Add spans in order of time. Spans that touch become one."""
     for start_s, end_s in more:
         if spans and start_s - spans[-1][1] < TIMES_APART_S:
             spans[-1] = (spans[-1][0], end_s)

@@ -19,15 +19,14 @@ def line_program(
 ) -> LineProgram:
     """Lay out the edges of all lines around one step.
 
-    The step begins after the longest lead, and the program ends after the longest lag, of the lines that
-    the step turns on. Lines that are on between steps but not in this one switch off when it is
-    fired.
+    The step begins after the longest lead, and the program ends after the longest lag, of the lines that the
+    step turns on. Lines that are on between steps but not in this step switch off when it is fired.
 
     Args:
         specs: The lines.
         kind: Kind of the step.
         duration_s: Duration of the step itself, in seconds.
-        pulses: When the step itself turns lines on, beyond those that are on in its kind of step.
+        pulses: Pulses that the step itself makes, in addition to the lines that its kind turns on.
 
     Example:
         >>> light = LineSpec("imaging", 4, ("image",), lead_s=1e-3, lag_s=2e-3)
@@ -82,7 +81,7 @@ def own_duration_s(specs: Sequence[LineSpec], bar: TimelineEntry) -> float:
 
 
 def trigger_line(specs: Iterable[LineSpec], role: str) -> LineSpec | None:
-    """The line that triggers a role; None if none does."""
+    """The line that triggers a role, or None if none does."""
     return next((spec for spec in specs if spec.triggers == role), None)
 
 
@@ -100,7 +99,7 @@ def _span(spec: LineSpec, kind: str, begin_s: float, end_s: float) -> tuple[Span
 
 
 def _apart(times: Iterable[float]) -> list[float]:
-    """Sorted times, without any that are too close to the one before; 0 stays 0."""
+    """Sorted times, without times too close to the previous one. 0 stays 0."""
     kept: list[float] = []
     for t in sorted(times):
         if not kept or t - kept[-1] > TIMES_APART_S:

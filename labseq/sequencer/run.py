@@ -39,13 +39,13 @@ class State(Enum):
     CLOSED = "closed"
     OPENING = "opening"
     IDLE = "idle"
-    """Between shots: mobile tweezers silent, camera not exposing, static tweezers on."""
+    """Between shots, with mobile tweezers silent, camera not exposing and static tweezers on."""
     SHOT = "shot"
     WRITING = "writing"
     RECOVERING = "recovering"
-    """After a failure that does not end the run: devices that may be busy are made safe."""
+    """After a failure that does not end the run, while devices that may be busy are made safe."""
     REOPENING = "reopening"
-    """Between shots: devices whose settings change are closed through their safe state and opened again."""
+    """Between shots, while devices whose settings change are made safe, closed and opened again."""
     MAKING_SAFE = "making safe"
     SAFE = "safe"
     CLOSING = "closing"
@@ -65,9 +65,9 @@ TRANSITIONS: Final = MappingProxyType(
         State.CLOSING: frozenset({State.CLOSED, State.MAKING_SAFE}),
     }
 )
-"""The state table: state -> states that may follow.
+"""The state table, state -> states that may follow.
 
-Every state in which a device may be on leads to MAKING_SAFE; making safe begins again if it was interrupted.
+Every state in which a device may be on leads to MAKING_SAFE. Making safe begins again if it was interrupted.
 """
 
 
@@ -90,12 +90,12 @@ class StateTable:
 def open_devices(
     lab: Lab, guard: Guard, stop: StopFlag, emit: Emit, names: Collection[str], watchdog: Watchdog
 ) -> None:
-    """Open the simulation and the devices of these names; then wait for those that need time.
+    """Open the simulation and the devices of these names, then wait for devices that need time.
 
-    The watchdog learns how each is switched off; then idle lines and static tweezers are turned on.
+    The watchdog learns how each is switched off. Then idle lines and static tweezers are turned on.
 
     Raises:
-        LabseqError: One of them fails, or the run is asked to stop.
+        LabseqError: A device fails, or the run is asked to stop.
     """
     timeout_s = lab.timeouts.call_s
     if lab.simulation is not None and "simulation" in names:
@@ -112,7 +112,7 @@ def open_devices(
     if "static_tweezers" in names:
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.load, None)
         guard.call("static_tweezers", timeout_s, lab.static_tweezers.start)
-    # after all are open: what settles has had the time since it was opened, and the others need not wait
+    # after all are open, so that a device settles while the others are opened
     for name, device in lab.hardware():
         if name not in names:
             continue
@@ -131,14 +131,14 @@ def plan_timelines(lab: Lab, guard: Guard, steps: Sequence[tuple[str, Step]]) ->
     """The timeline of each step.
 
     Raises:
-        LabseqError: A step fails; the error names it.
+        LabseqError: A step fails. The error names it.
     """
     planned = [plan_timeline(lab, guard, number, *step) for number, step in enumerate(steps)]
     return with_waits(planned, lab.step_context)
 
 
 def plan_timeline(lab: Lab, guard: Guard, number: int, name: str, step: Step) -> list[TimelineEntry]:
-    """The timeline of one step, see :func:`plan_timelines`; ``number`` is its index in the shot."""
+    """The timeline of one step, see :func:`plan_timelines`. ``number`` is its index in the shot."""
 
     def entries() -> list[TimelineEntry]:
         with _named(number, name):
@@ -175,15 +175,15 @@ class Sequencer:
 
     Args:
         policy: Reactions to failures and exceeded budgets.
-        parameters: Settings that differ from the files, recorded with each shot: address -> value.
-        watchdog: Switches the outputs off if this process dies or hangs; by default one without a log.
-        place_of: Where the shot of an index will be recorded if it counts: "run" and "file".
-        settings_for: The settings of a shot with values of another control system, by address; raises
+        parameters: Settings that differ from the files, address -> value, recorded with each shot.
+        watchdog: Switches the outputs off if this process dies or hangs. Default is one without a log.
+        place_of: Index of a shot -> the "run" and "file" where it will be recorded if it counts.
+        settings_for: The settings of a shot with values of another control system, by address. Raises
             ConfigError for values that are wrong or not allowed. None allows none.
 
     Attributes:
         lab: The devices.
-        unsafe: Devices that could not be made safe, and why; complete once the run is shut down.
+        unsafe: Devices that could not be made safe -> the reason. Complete once the run is shut down.
 
     Raises:
         LabseqError: A step fails to lay out its timeline.
@@ -242,21 +242,21 @@ class Sequencer:
         """Continue with other settings, between two shots.
 
         Args:
-            lab: The lab of the next shots; devices that are not reopened are the same objects.
+            lab: The lab of the next shots. Devices that are not reopened are the same objects.
             steps: Their steps, with their names.
-            parameters: Their settings that differ from the files: address -> value.
-            reopened: Devices, or "simulation", that are new in ``lab``: the present ones are made safe
-                and closed, then the new ones opened.
+            parameters: Their settings that differ from the files, address -> value.
+            reopened: Devices, or "simulation", that are new in ``lab``. The present ones are made safe and
+                closed, then the new ones opened.
 
         Raises:
-            LabseqError: A device fails; the caller must call :meth:`shut_down`.
+            LabseqError: A device fails. The caller must call :meth:`shut_down`.
         """
         if reopened:
             self._states.to(State.REOPENING)
             _raise_first(make_safe(self.lab, self.guard, reopened))  # all of them before any is closed
             _raise_first(close_all(self.lab, self.guard, reopened))
             self._watchdog.forget(reopened)
-        # before they are opened: if one fails to, the new ones are those to make safe
+        # before they are opened, because after a failure to open the new devices must be made safe
         self.lab, self._steps, self._parameters = lab, steps, dict(parameters)
         self.guard.direct = lab.direct_calls
         if reopened:
@@ -268,13 +268,13 @@ class Sequencer:
         open_devices(lab, self.guard, self._stop, self._emit, names, self._watchdog)
 
     def take(self, index: int) -> str:
-        """Take and write a shot; if it fails, repeat it as the policy says.
+        """Take and write a shot. If it fails, repeat it as the policy says.
 
         Returns:
-            Why it failed for good, and its point of the scan is to be skipped; "" for a shot that counts.
+            "" for a shot that counts. Else why it failed for good, and its scan point must be skipped.
 
         Raises:
-            LabseqError: The error that ended the run; the caller must call :meth:`shut_down` then, too.
+            LabseqError: The error that ended the run. The caller must call :meth:`shut_down` then, too.
         """
         attempt = 0
         while True:
@@ -285,14 +285,14 @@ class Sequencer:
             attempt += 1
 
     def shut_down(self, *, ended_well: bool = False) -> Mapping[str, LabseqError]:
-        """Safe state of every device, then close; from any state, any number of times.
+        """Make every device safe, then close it. May be called in any state, any number of times.
 
         Args:
-            ended_well: Whether the run took all its shots: static tweezers may then be left on, if every
+            ended_well: Whether the run took all its shots. Static tweezers may then be left on, if every
                 other device is safe.
 
         Returns:
-            The devices that could not be made safe, and why.
+            Devices that could not be made safe -> the reason.
         """
         if self.state is not State.CLOSED:
             if self.state is not State.SAFE:
@@ -322,23 +322,23 @@ class Sequencer:
                 outcome, after_s = end_safely(self.lab, self.guard)
         self.unsafe = {name: error for name, error in outcome.items() if error is not None}
         self._states.to(State.SAFE, announce=False)
-        self._announce(State.MAKING_SAFE)  # only now: neither a screen nor a disk may delay the devices
+        self._announce(State.MAKING_SAFE)  # only now, because no screen or disk may delay the devices
         self._report("safe_state", outcome, after_s)
         if event is not None:
             self._emit(*event)
         self._announce(State.SAFE)
 
     def _leave_on(self) -> tuple[str, dict[str, Any]] | None:
-        """Leave the static tweezers on if they are to be; returns the event that reports it, or why not."""
+        """Leave the static tweezers on if the profile asks for it. Returns the event that reports it."""
         name, device = "static_tweezers", self.lab.static_tweezers
         try:
             left = self.guard.call_despite_stop(name, self.lab.timeouts.safe_state_s, device.leave_on)
         except LabseqError as failure:
-            return "warning", {"text": f"{name} cannot be left on, and are switched off: {failure}"}
+            return "warning", {"text": f"{name} cannot be left on and are switched off: {failure}"}
         return ("left_on", {"device": name}) if left else None
 
     def _attempt(self, index: int, attempt: int) -> tuple[Then | None, str]:
-        """Make one attempt at a shot and write it; returns the reaction and the reason if it failed."""
+        """Make one attempt at a shot and write it. Returns the reaction and the reason if it failed."""
         self._states.to(State.SHOT)
         self._warn_of_watchdog()
         record = ShotRecord(index, attempt, self._seed, now_utc())
@@ -352,7 +352,7 @@ class Sequencer:
             shot.leaders = LeaderAnswers(shot, self.guard, self._events, place, self._settings_for)
         failure: LabseqError | None = None
         then: Then | None = None
-        try:  # what ends the run; within it, what the run goes on after
+        try:  # catches failures that end the run, the inner one failures after which it continues
             try:
                 self.guard.run_shot(partial(self._perform, shot))
             except LabseqError as error:
@@ -378,12 +378,12 @@ class Sequencer:
         return then, record.error
 
     def _check_writing_time(self, stages: Stages, host_s: float) -> None:
-        """Record how long writing took; a simulated run has no disk, so there it takes no time.
+        """Record how long writing took. A simulated run has no disk, so there it takes no time.
 
         Raises:
             OverBudgetError: It took longer than its budget, and the run's policy is to stop.
         """
-        # a shot that is on the disk is neither repeated nor skipped: these reactions become a warning
+        # a shot that is on the disk is neither repeated nor skipped, so these reactions become a warning
         then = self._policy.otherwise.over_budget
         stages.policy = StepPolicy(over_budget=then if then in (None, "record", "stop") else "warn")
         stages.done("write", 0.0 if self.lab.clock.virtual else host_s, host_s, math.nan, 0)
@@ -403,7 +403,7 @@ class Sequencer:
         images = unique_names([name for name, _ in self._steps])
         for number in range(len(self._steps)):
             self._stop.check()
-            name, step = shot.steps[number]  # a leader may have set other values at a step before
+            name, step = shot.steps[number]  # a leader may have set other values in an earlier step
             policy = self._policy.of_step(number)
             with shot.of_step(number, name, policy, images[number], needs_image=step.needs_image):
                 self._run_step(shot, number, name, step)
@@ -441,7 +441,7 @@ class Sequencer:
             _raise_first(make_safe(self.lab, self.guard, {"mobile_tweezers", "camera", "lines"}))
 
     def _abort(self, shot: RunningShot, status: ShotStatus, error: BaseException) -> None:
-        """Make the devices safe; only then answer the other control system and write the shot."""
+        """Make the devices safe before answering the other control system and writing the shot."""
         self._secure()
         with self._stop.held():  # a driver may have to wait for its device in order to answer
             self._tell_leaders(shot, error)

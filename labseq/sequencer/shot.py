@@ -1,4 +1,4 @@
-"""One attempt at a shot: the interface for steps, the time of each stage, and its record."""
+"""One attempt at a shot, with the interface for steps, the time of each stage, and its record."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ if TYPE_CHECKING:
 
 
 class Events:
-    """Reports the events of shots, and keeps this thread free of all that could delay it after a frame.
+    """Reports the events of shots, without delaying this thread after a frame.
 
-    From a frame to the start of the moves that follow from it they are kept, and Python collects no garbage:
-    a slow disk or screen, or a search for garbage, would take longer than all the rest.
+    From a frame to the start of the moves that follow from it, events are kept and Python collects no
+    garbage, because a slow disk or screen, or garbage collection, would take longer than everything else.
 
     Args:
-        guard: Knows which shot was abandoned; its events are dropped.
+        guard: Knows which shot was abandoned, so that its events are dropped.
     """
 
     def __init__(self, observer: RunObserver, guard: Guard) -> None:
@@ -72,7 +72,7 @@ class Events:
             self._observer.event(name, values)
 
     def expect_frame(self) -> None:
-        """Give this thread priority until the events are released: it waits for a frame."""
+        """Give this thread priority until the events are released, because it waits for a frame."""
         self._is_raised = raise_priority()
 
     def hold(self) -> None:
@@ -82,7 +82,7 @@ class Events:
             gc.disable()
 
     def release(self) -> None:
-        """Report the events that were kept, and those that follow at once."""
+        """Report the kept events now, and later events at once."""
         if self._is_raised:
             self._is_raised = False
             restore_priority()
@@ -120,11 +120,11 @@ class Stages:
         self._attempt_start_s = self.start_s
 
     def begin_step(self, number: int, name: str, policy: StepPolicy) -> None:
-        """Begin a step: the stages that follow belong to it."""
+        """Begin a step, to which the following stages belong."""
         self.step, self._name, self.policy, self._is_warned = number, name, policy, False
 
     def begin_attempt(self) -> None:
-        """Start an attempt at the step: its timeout counts from here."""
+        """Start an attempt at the step. Its timeout counts from here."""
         self._attempt_start_s = self._clock.now()
 
     def check_timeout(self) -> None:
@@ -135,12 +135,12 @@ class Stages:
         """
         limit_s = self.policy.limit_s
         if self._clock.now() - self._attempt_start_s > limit_s + OVERSHOOT_S:
-            text = f"step {self.step} ({self._name}) is not done after its timeout of "
+            text = f"step {self.step} ({self._name}) has not finished within its timeout of "
             raise StepTimeoutError(text + format_quantity(limit_s, "time"), limit_s)
 
     @contextmanager
     def around(self, name: str, budget_s: float, cycle: int) -> Generator[None]:
-        """Time a stage against its budget; it is recorded even if it fails.
+        """Time a stage against its budget. It is recorded even if it fails.
 
         Raises:
             OverBudgetError: It took longer, and the policy of the step does not allow that.
@@ -190,19 +190,19 @@ class Stages:
 P = ParamSpec("P")
 T = TypeVar("T")
 EARLY = 0.05
-"""Part of its exposure by which a frame may come early: cameras round exposure times."""
+"""Fraction of its exposure by which a frame may come early, because cameras round exposure times."""
 PLAYED_EARLY_S = 10e-6
-"""By how much a program may end early, beside the delay of the device, which may be shorter than it says."""
+"""How early a program may end, in addition to the device's delay, which may be shorter than stated."""
 
 
 class ShotSettings(NamedTuple):
-    """What a shot does, where it may differ from the shots before.
+    """The settings of a shot, which may differ from earlier shots.
 
     Attributes:
         lab: The devices, with planner and target.
         steps: Its steps, with their names.
         timelines: The timeline of each step.
-        parameters: The settings that differ from the files: address -> value.
+        parameters: The settings that differ from the files, address -> value.
     """
 
     lab: Lab
@@ -218,7 +218,7 @@ class RunningShot:
         record: Filled while the shot runs, so that nothing is lost if it fails.
 
     Attributes:
-        leaders: Speaks with other control systems; None without a device for one.
+        leaders: Talks to other control systems. None without a device for it.
     """
 
     leaders: LeaderAnswers | None = None
@@ -282,12 +282,12 @@ class RunningShot:
         *,
         needs_image: bool = False,
     ) -> Generator[None]:
-        """Context manager around a step: the stages, images and failures within belong to it.
+        """Context manager around a step, to which the stages, images and failures within belong.
 
         The length of its timeline, if it has one, is its budget.
 
         Args:
-            images: Beginning of the names of its images; by default its name.
+            images: Beginning of the names of its images. Default is the name of the step.
             needs_image: Whether it follows from the image before it.
 
         Raises:
@@ -311,11 +311,11 @@ class RunningShot:
             timed_by = ", ".join(dict.fromkeys(entry.timed_by.name for entry in entries))
             host_s = time.perf_counter() - host_start_s
             self.record.steps.append(StepTiming(number, name, timed_by, start_s, *durations, host_s))
-        # not after a failure: the sequencer asks for the policy of the step that failed
+        # not after a failure, because the sequencer asks for the policy of the step that failed
         self.stages.policy, self.in_step = NO_POLICY, False
 
     def record_duration(self, planned_s: float, achieved_s: float) -> None:
-        """Record the duration that hardware kept; see ``labseq.plugin.Shot``."""
+        """Record the duration that hardware kept. See ``labseq.plugin.Shot``."""
         self._kept = planned_s, achieved_s
 
     def device(self, name: str) -> Device:
@@ -324,12 +324,12 @@ class RunningShot:
             return self.lab.devices[name]
         except KeyError:
             known = ", ".join(self.lab.devices) or "none"
-            raise ConfigError(f"the profile has no device '{name}'; it has: {known}") from None
+            raise ConfigError(f"the profile has no device '{name}'; it has {known}") from None
 
     def take_frame(
         self, camera: str, exposure_s: float, light: AbstractContextManager[object] | None = None
     ) -> Frame:
-        """Take a frame of anything but atoms; see ``labseq.plugin.Shot``."""
+        """Take a frame of anything but atoms. See ``labseq.plugin.Shot``."""
         if camera == "camera":
             self.series.end()
         chosen: Any = self.lab.camera if camera == "camera" else self.device(camera)
@@ -338,7 +338,7 @@ class RunningShot:
     def call(
         self, owner: str, timeout_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """Call a device or plugin; see ``labseq.roles.Shot``.
+        """Call a device or plugin. See ``labseq.roles.Shot``.
 
         Raises:
             StepTimeoutError: The step has used up the time that its policy gives it.
@@ -347,7 +347,7 @@ class RunningShot:
         return self._guard.call(owner, timeout_s, function, *args, **kwargs)
 
     def poll(self) -> None:
-        """Record the values that are read at the start of a shot: from devices, and the thresholds."""
+        """Record values of devices, and the detector's thresholds, at the start of a shot."""
         for name, device in self.lab.hardware():
             if overrides(device, Hardware.poll):
                 values = self.call(name, self.call_timeout_s, device.poll)
@@ -363,7 +363,7 @@ class RunningShot:
             record.signal_unit = str(detector.signal_unit)
 
     def check_interlocks(self) -> None:
-        """Check the interlocks of every device; see ``labseq.plugin.Shot``."""
+        """Check the interlocks of every device. See ``labseq.plugin.Shot``."""
         for name, device in self.lab.hardware():
             if overrides(device, Hardware.check_interlocks):
                 try:
@@ -372,11 +372,11 @@ class RunningShot:
                     raise InterlockError(error.device, error.message) from error
 
     def follow(self, signal: str, timeout_s: float, device: str = "") -> None:
-        """Wait for the start signal of another control system; see ``labseq.plugin.Shot``."""
+        """Wait for the start signal of another control system. See ``labseq.plugin.Shot``."""
         self._leaders.follow(signal, timeout_s, device)
 
     def leave_to_leader(self, step: str, timeout_s: float, device: str = "") -> None:
-        """Let another control system do a step of its own; see ``labseq.plugin.Shot``."""
+        """Let another control system do a step of its own. See ``labseq.plugin.Shot``."""
         self._leaders.take_turn(step, timeout_s, device)
 
     @property
@@ -402,7 +402,7 @@ class RunningShot:
         start: Callable[[], object] | None = None,
         pulses: Pulses = NO_PULSES,
     ) -> Generator[None]:
-        """Fire the lines of a kind of step around it; see ``labseq.roles.Shot``."""
+        """Fire the lines of a kind of step around it. See ``labseq.roles.Shot``."""
         timeout_s, specs = self.call_timeout_s, self.lab.line_specs
         # lines that only pulses turn on need no program in other steps
         lines = self.lab.lines if pulses or any(spec.on for spec in specs) else None
@@ -432,7 +432,7 @@ class RunningShot:
         self.call("lines", left_s + DRIVER_MARGIN_S, lines.wait, left_s)
 
     def _record_edges(self, program: LineProgram, fired_s: float, tick_s: float) -> None:
-        """Record what a program changes, at the times that the box makes of its edges."""
+        """Record the edges of a program, at the times that the box rounds them to."""
         start_s = fired_s - self.start_s
         self.record.edges += [
             LineEdge(self.step, line, is_on, round(t_s / tick_s) * tick_s if tick_s else t_s, start_s)
@@ -440,7 +440,7 @@ class RunningShot:
         ]
 
     def _begin_moves(self, start: Callable[[], object] | None) -> None:
-        """Record how long after the frame the light of the mobile tweezers came, and report what was kept."""
+        """Record how long after the frame the mobile tweezers' light came, and report the kept events."""
         if start is not None and self._frame_s is not None:
             mobile, (frame_s, host_s) = self.mobile_tweezers, self._frame_s
             cycle = self.record.images[-1].cycle + 1 if self.record.images else -1
@@ -451,15 +451,15 @@ class RunningShot:
         self._events.release()
 
     def _check_end(self, least_s: float) -> None:
-        """Refuse a program that ended before it can be over: it was started by a trigger too many."""
+        """Raise if a program ended too early, because an extra trigger pulse started it."""
         early_s = self._fired_s + least_s - self.clock.now()
         if early_s > PLAYED_EARLY_S + self.mobile_tweezers.start_delay_s:
-            text = f"a program ended {format_quantity(early_s, 'time')} too early, so a pulse before that of"
-            text += " the line started it; look for a second edge at the trigger input"
+            text = f"a program ended {format_quantity(early_s, 'time')} too early, so an earlier pulse than"
+            text += " the line's started it; look for a second edge at the trigger input"
             raise DeviceError("mobile_tweezers", text)
 
     def release(self, duration_s: float) -> float:
-        """Turn the static tweezers off for a time that hardware keeps; see ``labseq.plugin.Shot``.
+        """Turn the static tweezers off for a time that hardware keeps. See ``labseq.plugin.Shot``.
 
         One command to the device turns them off and on again.
 
@@ -468,7 +468,7 @@ class RunningShot:
         """
         by, achieved_s = self.step_context.release_by, duration_s
         if by is None:
-            raise ConfigError("no line of this profile turns the static tweezers off, nor does their driver")
+            raise ConfigError("neither a line of this profile nor their driver turns the static tweezers off")
         with self.lines_on("release", duration_s):
             if by.name == "static_tweezers":
                 limit_s = duration_s + self.call_timeout_s
@@ -478,13 +478,13 @@ class RunningShot:
         return achieved_s
 
     def stage(self, name: str, budget_s: float = math.nan, cycle: int = -1) -> AbstractContextManager[None]:
-        """Time a stage against its budget; see ``labseq.sequencer.shot``."""
+        """Time a stage against its budget. See ``labseq.plugin.Shot``."""
         return self.stages.around(name, budget_s, cycle)
 
     def stage_done(
         self, name: str, duration_s: float, host_s: float, budget_s: float = math.nan, cycle: int = -1
     ) -> None:
-        """Record a stage that has just ended; see ``labseq.plugin.Shot``."""
+        """Record a stage that has just ended. See ``labseq.plugin.Shot``."""
         self.stages.done(name, duration_s, host_s, budget_s, cycle)
 
     def take_image(self, exposure_s: float, cycle: int = -1) -> Occupancy:
@@ -525,13 +525,13 @@ class RunningShot:
             self.call("mobile_tweezers", self.call_timeout_s, self.lab.mobile_tweezers.settle)
 
     def _name_of_image(self, cycle: int) -> str:
-        """A name that no other image of the shot has: that of the step, with the cycle or a number."""
+        """A unique name for an image of the shot, from the step's name with the cycle or a number."""
         name = f"{self._image_name}_cycle_{cycle}" if cycle >= 0 else self._image_name
         taken = {image.name for image in self.record.images}
         return next(one for n in itertools.count() if (one := f"{name}_{n}" if n else name) not in taken)
 
     def _expose(self, exposure_s: float, cycle: int) -> object:
-        """Take a frame; the stage "read_out" begins at the end of the exposure."""
+        """Take a frame. The stage "read_out" begins at the end of the exposure."""
         camera, specs, timeout_s = self.lab.camera, self.lab.line_specs, self.call_timeout_s
         limit_s, readout_s = timeout_s + exposure_s, self.lab.camera.facts.readout_s
         if not self.series.is_ready(exposure_s):
@@ -572,16 +572,16 @@ class RunningShot:
         self.clock.sleep(left_s)
 
     def _check_order(self, exposure_s: float) -> None:
-        """Refuse a frame that is there before its own exposure can be over: of a trigger too many."""
+        """Raise if a frame came before its exposure was over, because an extra trigger pulse started it."""
         early_s = self._fired_s + exposure_s - self.clock.now()
         if self.series.by_line and early_s > EARLY * exposure_s:
             text = f"a frame came {format_quantity(early_s, 'time')} before its exposure was over, so an"
             text += " earlier pulse at the camera's trigger input started it;"
-            text += " look at that line for a second edge"
+            text += " look for a second edge on that line"
             raise DeviceError("camera", text)
 
     def judge(self) -> None:
-        """Judge the shot on the image just taken; called by the ``image`` step alone."""
+        """Judge the shot on the image just taken. Only called by the ``image`` step."""
         if self.occupancy is None or self.target.is_none:
             return
         self.record.success = self.target.is_met_by(self.occupancy)
@@ -622,10 +622,12 @@ class RunningShot:
         self.record.atom_events.update(events)
 
     def _detected(self, answer: Any) -> tuple[Occupancy, Any, Any]:
-        """The detector's answer, checked: occupancy, confidence and, if it gives them, signals."""
+        """The checked answer of the detector, which is occupancy, confidence and perhaps signals."""
         shape = self.grid.shape
         if not (isinstance(answer, tuple) and len(cast("tuple[Any, ...]", answer)) in (2, 3)):
-            raise DeviceError("detector", f"detect() returned {type(answer).__name__}; expected a pair")
+            raise DeviceError(
+                "detector", f"detect() returned {type(answer).__name__}; expected a tuple of 2 or 3"
+            )
         parts = cast("tuple[Any, ...]", answer)
         for name, array, kind in zip(("occupancy", "confidence", "signals"), parts, "bff", strict=False):
             if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype.kind != kind:

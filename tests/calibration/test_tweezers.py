@@ -123,7 +123,7 @@ def test_tweezers_are_equalised_by_frames_of_a_camera_alone(
         (
             "camera of the atoms",
             ["profile.simulation.image.sensor=emccd", "profile.camera.em_gain=300"],
-            "no frame of other light than that of atoms with an EM gain of 300: .* set `em_gain` .* to 1",
+            "with an EM gain of 300 light other than the atoms' would age .* set `em_gain` .* to 1",
         ),
     ],
 )

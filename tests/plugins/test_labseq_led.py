@@ -125,7 +125,7 @@ def test_values_are_for_sequences_that_allow_them(tmp_path: Path) -> None:
         peer.leave()
 
     run_led(lead, tmp_path, "shot.2.rearrange.cycles=1", shots=1)
-    hint = "write 'leader: {may_set: [target.rows]}' in it"
+    hint = "add 'leader: {may_set: [target.rows]}' to it"
     assert said[0] == "busy"
     assert said[1].startswith("failed shot=0 ")
     assert f" refused=1 reason=the sequence does not let the leader set 'target.rows'; {hint}" in said[1]

@@ -295,4 +295,4 @@ def test_a_folder_without_locks_is_a_warning(monkeypatch: pytest.MonkeyPatch) ->
     (warning,) = (v["text"] for v in seen.of("warning") if "lock" in v["text"])
     file = lock_file(*resolve_profile("./p.yaml").identities)
     reason = "No locks available"
-    assert warning == f"{file} cannot be locked: {reason}: nothing keeps another process from shutter"
+    assert warning == f"{file} cannot be locked: {reason}; another process could use shutter at the same time"
