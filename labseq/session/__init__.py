@@ -1,4 +1,4 @@
-"""Builds a run from a sequence, a profile and plugins; opens the devices, takes the shots and records them.
+"""Builds a run from a sequence, a profile and plugins, opens the devices, takes the shots and records them.
 
-``labseq check`` is in ``check``; planning without a run in ``planning``, with its ``occupancies``.
+``labseq check`` is in ``check``. Planning without a run is in ``planning``, with its ``occupancies``.
 """

@@ -1,4 +1,4 @@
-"""The points of an adaptive scan: chosen by its scanner, by the results of those before."""
+"""The points of an adaptive scan, which its scanner chooses by the results of earlier points."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 
 class SearchedPoints:
-    """Points that a scanner chooses by the results of those before.
+    """Points that a scanner chooses by the results of earlier points.
 
-    Its choice depends only on the shots on disk: a resumed run continues as the original would have, and a
-    shot that is repeated is taken at its old point.
+    Its choice depends only on the shots on disk. A resumed run continues as the original would have, and a
+    repeated shot is taken at its old point.
 
     Args:
-        run: The run; receives the result of each point.
+        run: The run, which receives the result of each point.
         search: The scanner, and its ranges.
     """
 
@@ -45,7 +45,7 @@ class SearchedPoints:
         self._has_warned = self._quantity.name.startswith(RESULT_PREFIX)
 
     def next(self, history: History) -> Point | None:
-        """The point of the next shot; the scanner is asked when all shots of the one before are there."""
+        """The point of the next shot. The scanner is asked once all shots of the previous point are done."""
         number, last = history.next_number, history.last
         if last is not None:
             self._warn_if_missing(history.shots[history.point_of_shot[last]].get(last))
@@ -57,26 +57,26 @@ class SearchedPoints:
         return self._current[1]
 
     def known(self, history: History) -> Mapping[int, Point]:
-        """The point of the first shot to take, and the corners of the ranges; numbered from 1."""
+        """The point of the first shot to take, and the corners of the ranges, numbered from 1."""
         corners, first = self._search.corners, self.next(history)
         points = [corners.at(n) for n in range(math.prod(corners.scan.shape))]
         return dict(enumerate(points if first is None else [first, *points], start=1))
 
     def _choose(self, history: History, number: int | None) -> dict[str, float] | None:
-        """Ask the scanner; None if it has finished, or if no shot is left."""
+        """Ask the scanner. None if it has finished, or if no shot is left."""
         if number is None:
             return None
         visited = [one for one in self._first(history, number) if one.values]
         values = self._search.choose(self._scanner, visited, self._run.stop_flag)
         if values is None and number == 0:
-            raise DeviceError(self._search.name, "next_point() gave no point at all; expected a first one")
+            raise DeviceError(self._search.name, "next_point() gave no point at all; expected a first point")
         if values is None and history.last is not None:
             ended = {"scanner": self._search.name, "n_shots": history.to_take[0]}
             self._run.observers.event("scan_ended", ended)
         return values
 
     def _report(self, history: History, number: int) -> None:
-        """Report the score of a point whose shots have all been taken, and the best one so far."""
+        """Report the score of a point whose shots have all been taken, and the best point so far."""
         visited = self._first(history, number + 1)
         scores: dict[tuple[float, ...], tuple[int, list[float]]] = {}
         for place, one in enumerate(visited):  # a point that is visited again has the mean score
@@ -94,7 +94,7 @@ class SearchedPoints:
         self._run.observers.event("scan_point", about)
 
     def _values(self, history: History, number: int | None) -> dict[str, float] | None:
-        """The values of a point; None if no shot was attempted there."""
+        """The values of a point. None if no shot was attempted there."""
         if number is None:
             return None
         rows = [shot.row for shot in history.shots[number].values()]
@@ -102,14 +102,14 @@ class SearchedPoints:
         return None if row is None else self._search.values_in(row.parameters)
 
     def _warn_if_missing(self, shot: Shot | None) -> None:
-        """Warn once if a shot does not have the quantity: its name may be misspelt."""
+        """Warn once if a shot does not have the quantity, because its name may be misspelt."""
         if shot is not None and not self._has_warned and math.isnan(self._quantity.of_shot(shot)):
             self._has_warned = True
             present = quantities_in(shot.row)
             self._run.warn(missing_quantity(shot.index, self._quantity.name, TO_OPTIMISE, present))
 
     def _first(self, history: History, n_points: int) -> list[VisitedPoint]:
-        """The results of the first points, whose shots have all been taken or skipped; worked out once."""
+        """The results of the first points, whose shots have all been taken or skipped. Computed once."""
         for number in range(len(self._visited), n_points):
             self._visited.append(self._visit(history, number))
         return self._visited[:n_points]

@@ -1,4 +1,4 @@
-"""What `labseq check` advises beside its warnings: a planner that is expected to do better."""
+"""Advice of `labseq check` next to its warnings, about a planner that is expected to do better."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from labseq.session.prepared import PreparedRun
 from labseq.session.rehearsal import first_window_s
 
 N_LOADINGS: Final = 12
-"""Number of random loadings for which the two are compared."""
+"""Number of random loadings for which the two planners are compared."""
 
 
 def better_planner(run: PreparedRun, lab: Lab) -> str:
-    """A line if the planner `auto` is expected to leave clearly fewer defects than that of a run; else "".
+    """A line if the planner `auto` should leave clearly fewer defects than the run's planner, else "".
 
     Args:
-        run: The run; it has been checked.
+        run: The run, which has been checked.
         lab: The lab at its first point, with warm kernels.
     """
     assembly = run.assembly
@@ -45,11 +45,11 @@ def better_planner(run: PreparedRun, lab: Lab) -> str:
         now, then, choice = guard.call("planner", WARM_S, _compare, lab, chosen, window_s)
     except StopRequested:
         raise
-    except LabseqError:  # the check itself says what it finds wrong with a planner
+    except LabseqError:  # the check itself reports problems of a planner
         return ""
     finally:
         guard.end()
-    # another planner is worth a line if it leaves at most this part of the defects, and half a defect less
+    # another planner is worth a line if it leaves at most 80 % of the defects, and half a defect less
     if then.n_defects > min(0.8 * now.n_defects, now.n_defects - 0.5):
         return ""
     there, here = f"{then.n_defects:.1f} defects after one cycle", f"{now.n_defects:.1f}, {now}"
@@ -57,7 +57,7 @@ def better_planner(run: PreparedRun, lab: Lab) -> str:
 
 
 def _compare(lab: Lab, auto: ChosenPlugin, window_s: float) -> tuple[Expected, Expected, str]:
-    """What the lab's planner and `auto` are expected to leave, and which planner that is."""
+    """The expected results of the lab's planner and of `auto`, and the choice of `auto`."""
     planner, most = construct_planner(
         auto, Context(grid=lab.grid, motion=lab.motion, simulation=lab.simulation)
     )

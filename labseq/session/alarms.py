@@ -1,7 +1,7 @@
-"""Alarms: signs in a shot that the machine does not see or move atoms, which no check of a sequence asks for.
+"""Alarms, which notice in every shot if the machine does not see or move atoms, without a check for it.
 
 A camera that sees nothing, a laser that is off or a stage that does not move give shots that look complete.
-Each alarm warns when it begins; after some shots in a row it ends the run, so that a night is not lost.
+Each alarm warns when it begins. After some shots in a row it ends the run, so that a night is not lost.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from labseq.sequencer.clock import CLOCK_SET, SLEPT
 from labseq.units import format_quantity
 
 LEAST_COMPARED: Final = 10
-"""Minimum number: the mean of fewer is too uncertain."""
+"""Minimum number of loadings to compare with, because the mean of fewer is too uncertain."""
 LEAST_ATOMS: Final = 100
-"""Minimum number of sites, or of moved atoms, to judge a share by: those of few occur by chance."""
+"""Minimum number of sites, or of moved atoms, to judge a share by, because few give one by chance."""
 LEAST_CONFIDENCES: Final = 1000
-"""The same for the confidence, which a few doubtful sites decide."""
+"""The same for the confidence, which depends on a few doubtful sites."""
 
 
 class Latest:
@@ -44,9 +44,9 @@ class Latest:
         self.n_of = 0
 
     def add(self, n: float, n_of: int) -> float:
-        """Add a shot; returns the share, or nan as long as there are not enough."""
+        """Add a shot. Returns the share, or nan as long as there are not enough."""
         self._counts.append((n, n_of))
-        # as few shots as are enough: what was long before says little of the machine now
+        # as few shots as are enough, because old shots say little about the machine now
         while sum(count[1] for count in self._counts) - self._counts[0][1] >= self._least:
             self._counts.popleft()
         self.n, self.n_of = sum(n for n, _ in self._counts), sum(n_of for _, n_of in self._counts)
@@ -54,7 +54,7 @@ class Latest:
 
     @property
     def shots(self) -> str:
-        """Which shots they are of, if they are not of the last one alone."""
+        """The number of shots as text, or "" for only the last shot."""
         return f", in the last {len(self._counts)} shots" if len(self._counts) > 1 else ""
 
 
@@ -79,7 +79,7 @@ class Alarms:
         self._arrived = Latest(LEAST_ATOMS)
 
     def look(self, shot: ShotRecord) -> None:
-        """Look at a shot that was taken; attempts that did not complete are left out."""
+        """Look at a shot that was taken. Incomplete attempts are left out."""
         if shot.status != "complete":
             return
         found = dict(self._signs(shot))
@@ -93,7 +93,7 @@ class Alarms:
         """End the run if an alarm has lasted too long.
 
         Raises:
-            AlarmError: It has.
+            AlarmError: An alarm has lasted too long.
         """
         limit = self._settings.stop_after
         for name, n in self._in_a_row.items():
@@ -109,7 +109,7 @@ class Alarms:
         yield from self._clock(shot)
 
     def _frames(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
-        # the first and the last image tell it, and the others of a long shot would take time
+        # the first and the last image are enough, and the others of a long shot would take time
         for image in (*shot.images[:1], *shot.images[1:][-1:]):
             if image.frame is None:
                 continue
@@ -121,13 +121,13 @@ class Alarms:
                 what = (
                     f"{100 * share:.3g} % of the pixels of {which} have its highest value, {highest} counts"
                 )
-                yield "saturated", f"{what}; check the light, the gain, and whether the camera sees at all"
+                yield "saturated", f"{what}; check the light, the gain, and whether the camera sees anything"
             if self._settings.frozen and before is not None and np.array_equal(frame, before):
-                what = f"{which} is the same as the one before, pixel by pixel"
+                what = f"{which} is identical to the image before, pixel by pixel"
                 yield "frozen", f"{what}; the camera or its driver delivers an old frame"
 
     def _first_image(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
-        """Loading: none, everywhere, or far less than in the shots before at the same settings."""
+        """No loading, loading everywhere, or far less than in earlier shots with the same settings."""
         if not shot.images:
             return
         occupancy, settings = shot.images[0].occupancy, self._settings
@@ -141,12 +141,12 @@ class Alarms:
         others = self._loadings[repr(shot.parameters)]
         if len(others) >= LEAST_COMPARED:
             mean = float(np.mean(others))
-            # how far a loading must be below its mean, in standard deviations: few sites often load half of
+            # 5 standard deviations below the mean, because few sites often load only half of
             # the mean
             least = mean - 5.0 * math.sqrt(mean * (1.0 - mean / n_sites))
             if n_atoms < min(settings.loading * mean, least):
-                yield "loading", f"{_atoms(n_atoms)} loaded, {mean:.3g} on average in the shots before"
-                return  # shots after a failure are compared with those before it
+                yield "loading", f"{_atoms(n_atoms)} loaded, {mean:.3g} on average in earlier shots"
+                return  # later shots are compared with shots before the failure
         others.append(n_atoms)
 
     def _detection(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
@@ -155,7 +155,7 @@ class Alarms:
         shares = [self._confidences[step].add(one.sum(), one.size) for step, one in sums]
         if low := [share for share in shares if share < self._settings.confidence]:
             what = f"the detector's confidence is only {100 * min(low):.3g} % on average over the sites"
-            yield "confidence", f"{what}; do its thresholds and its width fit the gain and the exposure?"
+            yield "confidence", f"{what}; check its thresholds and width against gain and exposure"
 
     def _moves(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
         """Whether the atoms that the first cycle moved are seen where it moved them."""
@@ -174,10 +174,10 @@ class Alarms:
         slept_s, set_s = (shot.readings.get(name, 0.0) for name in (SLEPT, CLOCK_SET))
         if slept_s > self._settings.clock:
             slept = format_quantity(slept_s, "time")
-            yield "clock", f"the computer slept for {slept}; let it never suspend by itself"
+            yield "clock", f"the computer slept for {slept}; turn off its automatic suspend"
         elif abs(set_s) > self._settings.clock:
             what = f"the computer's clock has jumped by {format_quantity(set_s, 'time')}"
-            yield "clock", f"{what}: it was set, or the computer slept"
+            yield "clock", f"{what}, because it was set or the computer slept"
 
 
 def _atoms(n: float) -> str:

@@ -1,4 +1,4 @@
-"""Runs in a thread of a lab's own Python: shot by shot as it asks, or led by another control system."""
+"""Runs in a thread of a lab's own Python, one shot per call or led by another control system."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class ShotResult:
     Attributes:
         index: Its index in the run, from 0.
         success: Whether the last ``image`` step met the target.
-        filling: Filling of the target on that image, 0 to 1; nan if it was not judged.
+        filling: Filling of the target on that image, 0 to 1. nan if it was not judged.
         images: Names of the images, in the order they were taken.
         occupancies: bool (n_images, n_rows, n_cols), where an atom was detected.
         defects: Empty sites of the target on each image.
         timing: The stages, in the order they ended, in seconds after the start of the shot.
-        parameters: Address -> value, SI, of what differs from the files.
+        parameters: Settings that differ from the files, address -> value in SI.
         file: The shot's HDF5 file.
     """
 
@@ -75,7 +75,7 @@ class BackgroundRun:
     Attributes:
         started: Set once all devices are open, or the run has ended.
         idle: Set while no control system waits for the end of a shot, or for its file.
-        run_dir: Its folder; None before it has one.
+        run_dir: Its folder. None before it has one.
     """
 
     def __init__(self, session: Session) -> None:
@@ -103,7 +103,7 @@ class BackgroundRun:
             self.idle.set()
 
     def raise_error(self) -> None:
-        """Raise what ended the run, if that was an error."""
+        """Raise the error that ended the run, if any."""
         if self._error is not None:
             raise self._error
 
@@ -125,17 +125,17 @@ class BackgroundRun:
 
 
 class AskedShots(BackgroundRun):
-    """Takes the shots of a session one by one; implements ``labseq.session.prepared.Points``."""
+    """Takes the shots of a session one by one. Implements ``labseq.session.prepared.Points``."""
 
     def __init__(self, session: Session) -> None:
         super().__init__(session)
         if session.run_dir is not None:
             raise ConfigError("a session runs once; open another for the next run")
         if session.assembly.scanned is not None:
-            raise ConfigError("the sequence has a scan, which run() takes; shot() takes one shot at a time")
+            raise ConfigError("shot() takes no scans, but the sequence has one; use run()")
         self._led: LedPoints | None = session.assembly.led
         self._first: Point = session.assembly.first_point
-        # the run checks the first before it opens the devices; no other point has the id of a kept one
+        # the run checks the first before it opens the devices; the points are kept so that ids stay unique
         self._checked = {id(self._first): self._first}
         self._asked = queue.SimpleQueue[Point | None]()
         self._results = queue.SimpleQueue[ShotResult | None]()
@@ -143,7 +143,7 @@ class AskedShots(BackgroundRun):
         session.points = self
 
     def take(self, values: Mapping[str, Any]) -> ShotResult:
-        """Take a shot with these values; see :meth:`Session.shot`."""
+        """Take a shot with these values. See :meth:`Session.shot`."""
         point = self._point(values)
         if not self._has_begun:
             self._has_begun = True
@@ -166,7 +166,7 @@ class AskedShots(BackgroundRun):
             self.join()
 
     def next(self, history: History) -> Point | None:
-        """The point of the next shot, once it is asked for; called by the run."""
+        """The point of the next shot, once it is asked for. Called by the run."""
         if history.last is None and not self.started.is_set():
             return self._first  # the devices are built before anything is asked
         while history.to_take:
@@ -195,7 +195,7 @@ class AskedShots(BackgroundRun):
         texts = {k: v if isinstance(v, str) else json.dumps(v) for k, v in values.items()}
         if self._led is None and texts:
             what = f"the sequence does not allow '{next(iter(texts))}' to be set for each shot"
-            raise ConfigError(f"{what}; write 'leader: {{may_set: [{next(iter(texts))}]}}' in it")
+            raise ConfigError(f"{what}; add 'leader: {{may_set: [{next(iter(texts))}]}}' to it")
         point = self._first if self._led is None else self._led.with_texts(texts)
         if id(point) not in self._checked:
             guard = Guard(StopFlag())
@@ -214,7 +214,7 @@ class Served:
     """A run that another control system leads.
 
     Attributes:
-        address: Address of labseq for the control system: "127.0.0.1:5750".
+        address: Address of labseq for the control system, for example "127.0.0.1:5750".
         run_dir: Folder of the run.
     """
 
@@ -226,15 +226,15 @@ class Served:
 def serve(sequence: str | Path, **options: Any) -> Generator[Served]:
     """Run a sequence that another control system leads, in a thread of this process.
 
-    The block begins when all devices are open and labseq listens. At its end, labseq finishes the shot that
-    goes on, makes the devices safe and closes them.
+    The block begins when all devices are open and labseq listens. At its end, labseq finishes the current
+    shot, makes the devices safe and closes them.
 
     Args:
-        sequence: As for :meth:`Session.open`; a step `wait: {for: go, ...}` waits for the control system.
+        sequence: As for :meth:`Session.open`. A step `wait: {for: go, ...}` waits for the control system.
         **options: As for :meth:`Session.open`.
 
     Raises:
-        ConfigError: Something is wrong with the files, or no device of the profile has an address.
+        ConfigError: The files have an error, or no device of the profile has an address.
         LabseqError: The error that ended the run.
     """
     with Session.open(sequence, **options) as session:

@@ -1,4 +1,4 @@
-"""What differs between a run when it was begun and the same run today: code, calibrations and settings."""
+"""Differences in code, calibrations and settings between a run when it was begun and today."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def record_today(run: Run, assembly: Assembly, changes: Mapping[str, str]) -> Ru
 
     Args:
         run: The run as it was begun.
-        assembly: The same, assembled today.
-        changes: Its changes by options: address -> value.
+        assembly: The same run, assembled today.
+        changes: Its changes by options, address -> value.
     """
     code = code_of(assembly, Path.cwd(), [plugin["name"] for plugin in run.record["plugins"]])
     return run_record(assembly, run.seed, changes, Path.cwd(), code)
@@ -54,7 +54,7 @@ def changes_between(run: Run, today: RunRecord) -> list[Change]:
 
     Args:
         run: The run as it was begun.
-        today: What :func:`record_today` gives.
+        today: The result of :func:`record_today`.
     """
     then, now = run.record, plain_record(today)
     plugins = {plugin["name"] for plugin in then["plugins"]}  # earlier versions of labseq recorded fewer
@@ -89,13 +89,13 @@ def first_difference(file: str, before: bytes | None, after: bytes | None) -> Ch
     pairs = enumerate(zip_longest(*lines, fillvalue=""), 1)
     number, pair = next((number, pair) for number, pair in pairs if pair[0] != pair[1])
     stripped = tuple(line.strip() for line in pair)
-    # lines may differ in their indentation or their ends alone
+    # lines may differ only in their indentation or their ends
     was, now = _around_difference(*(stripped if stripped[0] != stripped[1] else pair))
     return Change(f"{file}, line {number}", repr(was), repr(now))
 
 
 def _around_difference(was: str, now: str) -> tuple[str, str]:
-    """Two lines, of long ones the part in which they begin to differ."""
+    """Two lines, with long lines cut to the part in which they begin to differ."""
     different = (i for i, (before, after) in enumerate(zip(was, now, strict=False)) if before != after)
     n_same = next(different, min(len(was), len(now)))
     start = max(0, n_same - _MAX_TEXT // 2) if max(len(was), len(now)) > _MAX_TEXT else 0
@@ -117,7 +117,7 @@ def plain_record(record: RunRecord) -> dict[str, Any]:
 
 
 def _made_with(record: Mapping[str, Any], plugins: Container[str]) -> dict[str, Any]:
-    """Versions, code state, some plugins and the calibrations of a run: name -> value."""
+    """Versions, code state, some plugins and the calibrations of a run, as name -> value."""
     provenance = record["provenance"]
     code = (provenance.get("git") or {}).get("code") or {}
     found = {"labseq": provenance.get("labseq"), "labseq's commit": code.get("commit")}
@@ -163,7 +163,7 @@ def _cut(text: str) -> str:
 
 
 def _same(was: Any, now: Any, folder: Any) -> bool:
-    """Whether two values are the same; each path is relative to the working folder of its record."""
+    """Whether two values are the same. Each path is relative to the working folder of its record."""
     if was == now:
         return True
     if not (isinstance(was, str) and isinstance(now, str) and isinstance(folder, str)):

@@ -1,4 +1,4 @@
-"""`labseq check`: computes timeline, duration, disk space and warnings of a run, without opening a device."""
+"""`labseq check`, which computes timeline, duration, disk space and warnings without opening a device."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ from labseq.units import format_quantity, size_text
 N_LOADINGS: Final = 200
 """Maximum number of random loadings for which the planner is run."""
 N_LOADINGS_ELSEWHERE: Final = 20
-"""The same for later points of a scan; windows are judged by a quarter of it at least."""
+"""The same for later points of a scan. Windows are judged by at least a quarter of it."""
 MAX_WAIT_S: Final = 2.0
-"""Time after which no further loading is tried, in seconds of real time; of all others together the same."""
+"""Real time after which no further loading is tried at the first point, and at all others together, in s."""
 
 Timeline: TypeAlias = Sequence[tuple[str, Sequence[TimelineEntry]]]
 """Name and bars of each step."""
 
 
 class _Checks:
-    """The checks of a run; points with the same settings are checked once."""
+    """The checks of a run. Points with the same settings are checked once."""
 
     def __init__(self, run: PreparedRun, guard: Guard) -> None:
         self.run = run
@@ -60,7 +60,7 @@ class _Checks:
 
     def of(self, point: Point) -> _PointCheck:
         """The checks of a point."""
-        # by identity: points share the objects that are the same at both
+        # by identity, because points share the objects that are the same at both
         key = (*point.lab_key, *(id(step) for _, step in point.steps))
         if key not in self._points:
             if point.lab_key not in self._labs:
@@ -69,7 +69,7 @@ class _Checks:
         return self._points[key]
 
     def raise_problems(self) -> None:
-        """Raise the problems, unless the check was stopped: calls that end early report nothing."""
+        """Raise the problems, unless the check was stopped, because calls that end early report nothing."""
         self.run.stop_flag.check()
         try:
             self.problems.raise_any()
@@ -79,14 +79,14 @@ class _Checks:
 
 
 class _PointCheck:
-    """What devices and steps say of the settings of a point; no device is open."""
+    """Checks the settings of a point with devices and steps, without an open device."""
 
     def __init__(self, checks: _Checks, point: Point, lab: Lab) -> None:
         self.checks = checks
         self.point = point
         self.lab = lab
         self.windows = windows_of(point.steps)
-        # what is planned; the last windows do not change it
+        # everything that the plans depend on, which leaves out the last windows
         self.rehearsal_key: tuple[object, ...] = (id(lab), *[*self.windows.values()][:-1])
         self.shot = checks.run.assembly.sequence.shot
         self._guard = checks.guard
@@ -98,7 +98,7 @@ class _PointCheck:
 
     @property
     def longest_exposure_s(self) -> float:
-        """The longest exposure of a shot, in seconds; 0 without images."""
+        """The longest exposure of a shot, in seconds. 0 without images."""
         return max((bar.exposure_s for _, bars in self.timeline for bar in bars), default=0.0)
 
     @property
@@ -114,7 +114,7 @@ class _PointCheck:
         self.checks.problems.add(self.point.hardware.document.error(loc, what, expected, hint))
 
     def ask_settings(self) -> None:
-        """Have every device look for what its settings name, such as files."""
+        """Have every device check its settings, for example for missing files."""
         for name, device in self.lab.hardware():
             chosen = self.point.hardware.chosen[name]
             problems = self._guard.call(name, WARM_S, device.check_settings)
@@ -131,7 +131,7 @@ class _PointCheck:
 
     @cached_property
     def timeline(self) -> Timeline:
-        """Name and bars of each step, without those that cannot lay out theirs."""
+        """Name and bars of each step, except for steps that cannot lay out theirs."""
         named: list[tuple[str, list[TimelineEntry]]] = []
         for number, (name, step) in enumerate(self.point.steps):
             try:
@@ -153,7 +153,7 @@ class _PointCheck:
                 self._add(loc, problem.what, problem.expected, problem.hint)
 
     def ask_devices(self) -> None:
-        """Have camera and lines check what each step of a shot would ask of them."""
+        """Have camera and lines check the demands of each step of a shot."""
         for spec, (_, bars) in zip(self.shot, self.timeline, strict=True):
             for bar in {
                 (one.kind, one.duration_s, one.exposure_s, repr(one.pulses)): one for one in bars
@@ -171,7 +171,7 @@ class _PointCheck:
             self._ask_timeouts()
 
     def _ask_images(self) -> None:
-        """The camera must have what triggers it, and the detector must take its frames."""
+        """Check that the camera has a trigger, and that the detector accepts its frames."""
         lab, facts = self.lab, self.lab.step_context.camera
         if "software" not in facts.triggers and trigger_line(lab.line_specs, "camera") is None:
             what = (
@@ -185,11 +185,11 @@ class _PointCheck:
         try:
             self._guard.call("detector", WARM_S, lab.detector.detect, Frame(image, 1.0, 0.0))
         except LabseqError as error:
-            if error.__cause__ is None:  # it refuses the frame; a failure may be due to the noise on it
+            if error.__cause__ is None:  # it refuses the frame, while a failure may be due to the noise on it
                 self._add_to_profile(("detector", "use"), str(error))
 
     def _ask_line_trigger(self) -> None:
-        """Exposures must suit what the line that triggers the camera does."""
+        """Check that the exposures suit the line that triggers the camera."""
         context = self.lab.step_context
         if trigger_line(self.lab.line_specs, "camera") is None:
             return
@@ -206,16 +206,16 @@ class _PointCheck:
             self._check_exclusive(program)
 
     def _check_exclusive(self, program: LineProgram) -> None:
-        """Refuse pulses that turn lines on together which the profile declares mutually exclusive."""
+        """Refuse pulses that turn on mutually exclusive lines of the profile at the same time."""
         lines = self.point.hardware.profile.lines
         for pair in () if lines is None else lines.mutually_exclusive:
             first, second = (program.on[:, program.lines.index(name)] for name in pair)
             if (first & second).any():
-                what = f"'{pair[0]}' and '{pair[1]}' are on together, and the profile declares them"
+                what = f"'{pair[0]}' and '{pair[1]}' are on together, but the profile declares them"
                 raise ConfigError(f"{what} mutually exclusive")
 
     def _ask_timeouts(self) -> None:
-        """A timeout that is written in the profile must be longer than the exposures."""
+        """Check that a timeout in the profile is longer than the exposures."""
         loc, call_s = ("timeouts", "call"), self.lab.timeouts.call_s
         if self.point.hardware.document.get(loc) is not None and call_s < self.longest_exposure_s:
             call, exposure = (format_quantity(s, "time") for s in (call_s, self.longest_exposure_s))
@@ -239,7 +239,7 @@ class _PointCheck:
 
 
 def _badly_timed(point_check: _PointCheck) -> Iterator[tuple[int, Problem, bool]]:
-    """Steps of fixed length that the computer cannot keep, or only roughly: index, what, if refused."""
+    """Index, problem and refusal of steps of fixed length that the computer keeps roughly or not."""
     timelines = [bars for _, bars in point_check.timeline]
     least = format_quantity(COMPUTER.accuracy_s, "time")
     for number, bars in enumerate(timelines):
@@ -252,22 +252,23 @@ def _badly_timed(point_check: _PointCheck) -> Iterator[tuple[int, Problem, bool]
         duration, late = (format_quantity(t, "time") for t in (duration_s, late_s))
         if duration_s < COMPUTER.accuracy_s:
             what = (
-                f"the computer cannot keep {duration}: it is typically 0.4 ms late, now and then several ms"
+                f"{duration} is too short for software timing, which is typically 0.4 ms and sometimes "
+                "several ms late"
             )
             by = point_check.lab.step_context.release_by
             hint = "to free the atoms, use the step `release`"
             hint += f", which '{by.name}' times" if by else ""
-            hint += "; to pulse a light, use a line that is on in `wait` alone"
+            hint += ", and to pulse a light, a line that is on only in `wait`"
             yield number, Problem(what, expected=f"at least {least}", hint=hint), True
         elif late_s > 0.1 * duration_s:  # less needs no warning
-            what = f"the computer cannot time {duration} exactly: it may last about {late} longer"
+            what = f"the computer cannot time {duration} exactly, so it may last about {late} longer"
             if after.latency_s:
                 what += f", because '{after.label}' begins late at the outputs of '{after.timed_by.name}'"
             yield number, Problem(what), False
 
 
 def _wrong_settings(guard: Guard, lab: Lab, name: str, step: Step) -> dict[str, Problem]:
-    """Setting -> what is wrong with it, as a step says; "" for a step that fails to say it."""
+    """Setting -> its problem, according to a step. "" is the setting if the step's check fails."""
     devices, timeout_s = dict(lab.hardware()), lab.timeouts.call_s
     try:
         answer = guard.call(f"step '{name}'", timeout_s, step.check_devices, devices, lab.step_context)
@@ -276,11 +277,11 @@ def _wrong_settings(guard: Guard, lab: Lab, name: str, step: Step) -> dict[str, 
     except LabseqError as failure:
         return {"": Problem(str(failure))}
     except (TypeError, ValueError):
-        return {"": Problem(f"check_devices() of step '{name}' returned no mapping")}
+        return {"": Problem(f"check_devices() of step '{name}' did not return a mapping")}
 
 
 def _timing_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
-    """Warnings about durations that the computer keeps roughly."""
+    """Warnings about durations that the computer keeps only roughly."""
     for number, problem, is_refused in _badly_timed(point_check):
         if not is_refused:
             place = (*point_check.shot[number].loc, "duration")
@@ -306,16 +307,16 @@ class CheckReport:
     """Timeline, duration, disk space and warnings of a run, before it starts.
 
     Attributes:
-        timeline: Name of each step and its bars; for a scan, like all but ``run_s``, at its first point.
+        timeline: Name and bars of each step. In a scan, this and all but ``run_s`` are for the first point.
         n_shots: Shots of the run.
-        n_points: Points of the scan that these shots are at; None without a scan.
+        n_points: Number of scan points that these shots visit. None without a scan.
         run_s: Minimum and maximum duration of the run, in seconds.
         warnings: Settings that are allowed but probably not intended, with their place in the files.
-        rehearsal: The planner's results for random loadings; None without a rearrangement.
-        shot_bytes: Size of a shot on disk at most; None if the camera does not report its frame shape.
+        rehearsal: The planner's results for random loadings. None without a rearrangement.
+        shot_bytes: Maximum size of a shot on disk. None if the camera does not report its frame shape.
         free_bytes: Free space on the disk of the data folder.
-        lab: Devices and planner at the first point; none is open.
-        planner_choice: What the planner has chosen for the target, then the alternatives.
+        lab: Devices and planner at the first point, none of them open.
+        planner_choice: The planner's choice for the target, then the alternatives.
     """
 
     timeline: Timeline
@@ -351,14 +352,14 @@ class CheckReport:
 
 
 def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
-    """Compute timeline, duration, disk space and warnings of a run; no device is opened.
+    """Compute timeline, duration, disk space and warnings of a run, without opening a device.
 
     Args:
-        run: The run; its sequence and profile have no errors.
-        runs: Whether a run follows; then the kernels of the devices are compiled with those of the planner.
+        run: The run, whose sequence and profile have no errors.
+        runs: Whether a run follows. Then the kernels of devices are compiled as well as the planner's.
 
     Raises:
-        ConfigError: What a device or plugin would refuse in the first shot at some point of the run.
+        ConfigError: A device or plugin would refuse the first shot at some point of the run.
     """
     assembly, guard = run.assembly, Guard(run.stop_flag)
     checks = _Checks(run, guard)
@@ -406,10 +407,10 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
 
 
 def check_settings(run: PreparedRun, guard: Guard, point: Point, lab: Lab) -> list[list[TimelineEntry]]:
-    """Check the settings of a shot with the steps and devices of a running run; returns the timelines.
+    """Check the settings of a shot with the steps and devices of a running run. Returns the timelines.
 
     Raises:
-        ConfigError: What a step, camera or lines would refuse.
+        ConfigError: A step, the camera or the lines would refuse them.
     """
     checks = _Checks(run, guard)
     checks.detectors.append(lab.detector)
@@ -435,14 +436,14 @@ def _run_s(checks: _Checks) -> tuple[float, float]:
 
 
 def _warnings(checks: _Checks, numbers: Mapping[_PointCheck, Collection[int]]) -> list[Problem]:
-    """What is allowed but probably not intended, once, with the points of the scan where it is so."""
+    """Settings that are allowed but probably not intended, each once, with its points of the scan."""
     warnings: dict[Any, tuple[Problem, list[int]]] = {}
     is_adaptive, n_points = checks.run.assembly.search is not None, sum(map(len, numbers.values()))
     judges = _window_warnings, _parallelism_warnings, _deadline_warnings, _timeout_warnings
     for judge in (*judges, _timing_warnings, _device_warnings, _instance_warnings):
         for point_check, of_check in numbers.items():
             if 0 not in of_check and is_adaptive and judge is _window_warnings:
-                continue  # the search is there to find out about the corners
+                continue  # the search is meant to explore the corners
             for key, problem in judge(point_check):
                 warnings.setdefault((judge, key), (problem, []))[1].extend(of_check)
     texts: list[Problem] = []
@@ -456,12 +457,12 @@ def _warnings(checks: _Checks, numbers: Mapping[_PointCheck, Collection[int]]) -
 
 
 def _rehearse_all(checks: _Checks, points: Iterable[_PointCheck], runs: bool) -> None:
-    """Rehearse the moves at every point that differs from those before it."""
+    """Rehearse the moves at every point that differs from earlier points."""
     run = checks.run
     distinct: dict[tuple[object, ...], _PointCheck] = {}
     for point_check in points:
         distinct.setdefault(point_check.rehearsal_key, point_check)
-    # the first point may take MAX_WAIT_S; all others together as long again
+    # the first point may take MAX_WAIT_S, and all others together as long again
     wait_s, asked = MAX_WAIT_S / max(1, len(distinct) - 1), set[int]()
     for n, (key, point_check) in enumerate(distinct.items()):
         checks.rehearsals[key] = []
@@ -498,7 +499,7 @@ def _plan_options(assembly: Assembly, point: Point) -> str:
 def _window_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
     document, shot = point_check.point.document, point_check.shot
     windows, rehearsals = point_check.windows, point_check.rehearsed
-    # a slow planner made too few plans in the time there was to judge a window by
+    # a slow planner made too few plans in this time to judge a window
     if (
         min((rehearsal.n_loadings for rehearsal in rehearsals.values()), default=0)
         < N_LOADINGS_ELSEWHERE // 4
@@ -514,7 +515,7 @@ def _window_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
             what += f" ({n_fit} of {rehearsal.n_loadings} fit)"
             yield number, document.problem(loc, what, f"about {enough}, enough for 95 % of the plans")
         elif shortest < quantile(rehearsal.first_batch_s, 0.5):
-            what = f"a window of {format_quantity(shortest, 'time')} is over before the first batch is"
+            what = f"a window of {format_quantity(shortest, 'time')} ends before the first batch does"
             yield number, document.problem(loc, what, "more than the overheads of a cycle and a batch")
     loaded = next(iter(rehearsals.values()))
     if loaded.n_enough < 0.9 * loaded.n_loadings:
@@ -529,17 +530,17 @@ def _window_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
 
 
 def _light_warnings(assembly: Assembly, lab: Lab) -> Iterator[Problem]:
-    """Imaging light that nothing switches, and light that might harm the camera and is not declared."""
+    """Warn of imaging light that nothing switches, and of undeclared light that might harm the camera."""
     if any(step.takes_image for _, step in assembly.steps) and not _may_be_lit(assembly, lab):
-        what = "nothing of this profile switches the imaging light"
-        hint = "a line for it, with `on: [image]`, under `lines`; see docs/how-to/lines.md"
+        what = "nothing in this profile switches the imaging light"
+        hint = "add a line for it under `lines`, with `on: [image]` (docs/how-to/lines.md)"
         yield assembly.hardware.document.problem(("camera", "use"), what, hint=hint)
     if lab.step_context.camera.em_gain > 1:
         yield from _undeclared_light(assembly, lab.step_context.camera.em_gain)
 
 
 def _may_be_lit(assembly: Assembly, lab: Lab) -> bool:
-    """Whether a line or a step may switch the imaging light; a simulated camera needs none."""
+    """Whether a line or a step may switch the imaging light. A simulated camera needs none."""
     if not assembly.hardware.chosen["camera"].identities("camera"):
         return True
     if any(step.device_setting or step.signal for _, step in assembly.steps):
@@ -550,7 +551,7 @@ def _may_be_lit(assembly: Assembly, lab: Lab) -> bool:
 
 
 def _undeclared_light(assembly: Assembly, gain: float) -> Iterator[Problem]:
-    """Lines that may switch a light outside of exposures, and do not say whether it blinds the camera."""
+    """Lines that may switch a light outside of exposures, without a statement on whether it is blinding."""
     document, lines = assembly.hardware.document, assembly.hardware.profile.lines
     for name, channel in {} if lines is None else lines.channels.items():
         is_light = not (channel.triggers or channel.turns_off or "image" in channel.on)
@@ -563,7 +564,7 @@ def _undeclared_light(assembly: Assembly, gain: float) -> Iterator[Problem]:
 
 
 def _judgement_warnings(assembly: Assembly, rearrangements: Sequence[int]) -> list[Problem]:
-    """Warn if no ``image`` step judges the shots; a fixed number of cycles is judged by its own images."""
+    """Warn if no ``image`` step judges the shots. A fixed number of cycles is judged by its own images."""
     images = [n for n, (_, step) in enumerate(assembly.steps) if step.takes_image and n not in rearrangements]
     if not rearrangements or max(images, default=-1) > rearrangements[-1]:
         return []
@@ -585,7 +586,7 @@ def _parallelism_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Probl
 
 
 def _deadline_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
-    """The steps after a wait for a signal, up to the next wait or the end, must fit into its deadline."""
+    """Warn if steps between a wait for a signal and the next wait or the end exceed its deadline."""
     timeline, lab, point = point_check.timeline, point_check.lab, point_check.point
     waits = [bool(step.signal) for _, step in point.steps]
     for number, (_, step) in enumerate(point.steps):
@@ -593,22 +594,22 @@ def _deadline_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]
             continue
         try:
             name, leader = find_leader(dict(lab.hardware()), step.device)
-        except ConfigError:  # no wait for a signal: another step's own attribute
+        except ConfigError:  # not a wait for a signal, but another step's own attribute
             continue
         until = next((n for n in range(number + 1, len(waits)) if waits[n]), None)
         bars = [bar for _, of_step in timeline[number + 1 : until] for bar in of_step]
         longest_s = sum(bar.duration_s for bar in bars if bar.timed_by.name != "leader")
         if longest_s > leader.deadline_s:
             longest = format_quantity(longest_s, "time")
-            what = f"what follows takes up to {longest}, but '{name}' must be answered within "
+            what = f"the following steps take up to {longest}, but '{name}' must be answered within "
             what += format_quantity(leader.deadline_s, "time")
             loc = (*point_check.shot[number].loc, "for")
-            hint = "raise 'deadline' in the profile, or the other system is informed that the shot failed"
+            hint = "raise 'deadline' in the profile, else the other system is told that the shot failed"
             yield number, point.document.problem(loc, what, hint=hint)
 
 
 def _instance_warnings(point_check: _PointCheck) -> Iterator[tuple[str, Problem]]:
-    """What the simulation and the mobile tweezers themselves warn of."""
+    """Warnings of the simulation and of the mobile tweezers themselves."""
     lab = point_check.lab
     for name, instance in (("simulation", lab.simulation), ("mobile_tweezers", lab.mobile_tweezers)):
         if instance is not None:
@@ -617,7 +618,7 @@ def _instance_warnings(point_check: _PointCheck) -> Iterator[tuple[str, Problem]
 
 
 def _device_warnings(point_check: _PointCheck) -> Iterator[tuple[int, Problem]]:
-    """What the settings of the devices themselves warn of."""
+    """Warnings of the devices' own settings."""
     number = 0
     for chosen in point_check.point.hardware.chosen.values():
         if chosen.settings is None or chosen.document is None:
@@ -633,15 +634,15 @@ def _shot_bytes(assembly: Assembly, lab: Lab, bars: Sequence[TimelineEntry]) -> 
     kept = {"all": n_images, "last": min(1, n_images), "none": 0}[assembly.sequence.record_frames]
     if shape is None and kept:
         return None
-    # what the file holds of each site on an image: occupancy, confidence, signal
+    # bytes of each site on an image, for occupancy, confidence and signal
     per_image = 13 * lab.grid.n_rows * lab.grid.n_cols
     # approximate size of a shot file without images, in bytes
     return 60_000 + n_images * per_image + kept * 2 * math.prod(shape or (0,))
 
 
 def _disk_warnings(run: PreparedRun, shot_bytes: int, free_bytes: int) -> Iterator[Problem]:
-    """The shots that are still to be taken may need more than is free."""
+    """Warn if the remaining shots may need more disk space than is free."""
     if (n_bytes := len(run.history.to_take) * shot_bytes) > free_bytes:
-        what = f"the run may need {size_text(n_bytes)}, and the disk has {size_text(free_bytes)} free"
+        what = f"the run may need {size_text(n_bytes)}, but the disk has only {size_text(free_bytes)} free"
         hint = "free some, choose another folder with --output, or keep fewer frames with record_frames"
-        yield Problem(what, visible(str(run.root)), hint=f"{hint}; a run that fills the disk can be resumed")
+        yield Problem(what, visible(str(run.root)), hint=f"{hint} (a run that fills the disk can be resumed)")

@@ -1,4 +1,4 @@
-"""A session: one sequence on one profile, from the files to the data; its shots, each at its point."""
+"""A session, which takes a sequence on a profile from the files to the data, with each shot at its point."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ P = ParamSpec("P")
 
 @contextmanager
 def only_new_garbage() -> Generator[None]:
-    """Keep the garbage collector from searching what exists now: it would take 0.1 s of a shot."""
+    """Exclude existing objects from garbage collection, which would take 0.1 s of a shot."""
     gc.freeze()
     try:
         yield
@@ -60,17 +60,17 @@ def only_new_garbage() -> Generator[None]:
 
 
 class Shots:
-    """Takes the shots of a run, each at its point; how the points come about is no concern of it.
+    """Takes the shots of a run, each at its point. Others choose the points.
 
     Args:
         run: The run.
         lab: The devices, not open, at the first point.
-        first: That point.
+        first: The first point.
         writer: Records the shots.
         watchdog: Switches the outputs off if this process dies or hangs.
 
     Attributes:
-        sequencer: Takes each shot; the caller opens it and shuts it down.
+        sequencer: Takes each shot. The caller opens it and shuts it down.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Shots:
         )
 
     def _settings_for(self, lab: Lab, first: Point) -> Callable[[Mapping[str, str]], ShotSettings] | None:
-        """What makes the settings of a shot from the values of a leader; None if it may set none."""
+        """Makes the settings of a shot from the values of a leader. None if it may set none."""
         if (led := self._run.assembly.led) is None:
             return None
         from labseq.session.led import LedShots  # most runs have no leader
@@ -109,7 +109,7 @@ class Shots:
         self._run.observers.event("warning", {"text": text, "alarm": alarm})
 
     def write_shot(self, shot: ShotRecord) -> IndexRow:
-        """Write a shot with the jumps of clocks that it saw; look for alarms while its frames are there."""
+        """Write a shot with the clock jumps during it. Look for alarms while its frames are in memory."""
         if jumps := self._clock_jumps.since_last():
             shot.readings |= jumps
             about = {"shot": shot.shot_index, "attempt": shot.attempt}
@@ -123,8 +123,8 @@ class Shots:
         """Take the shots until none is left, the points end, or the fits are precise enough.
 
         Args:
-            checks: Checks each shot; may end the run, or skip the rest of a point.
-            precision: Judges the fits; None if the run takes all its shots.
+            checks: Checks each shot. It may end the run, or skip the rest of a point.
+            precision: Judges the fits. None if the run takes all its shots.
 
         Raises:
             StopRequested: The run was asked to end.
@@ -134,7 +134,7 @@ class Shots:
         """
         points, history = self._run.points, self._run.history
         last, why = checks.left_open
-        if why:  # an earlier process may have died before it could record what it skips
+        if why:  # an earlier process may have died before it could record the skipped shots
             self._skip(history.later_at_its_point(last), why)
         while (point := points.next(history)) is not None:
             if (self._writer.run_dir / STOP_FILE).exists():  # `labseq stop` in another process
@@ -154,7 +154,7 @@ class Shots:
                 return
 
     def _move_to(self, point: Point) -> None:
-        """Change what differs between the present point and the next."""
+        """Change the settings that differ between the present point and the next."""
         if point is self._point:
             return
         from labseq.assembly.points import rebuild_lab  # only scans have several points
@@ -166,7 +166,7 @@ class Shots:
         self._point = point
 
     def _parameters(self, point: Point) -> dict[str, Any]:
-        """The settings at a point that differ from the files: address -> value."""
+        """The settings at a point that differ from the files, address -> value."""
         changes = {address: change["value"] for address, change in self._writer.run.overrides.items()}
         return {**changes, **point.parameters}
 
@@ -181,7 +181,7 @@ class Shots:
 
 
 class Session(PreparedRun):
-    """Opens a sequence, runs it, and leaves every device safe; a context manager.
+    """Context manager that opens a sequence, runs it, and leaves every device safe.
 
     Example:
         with labseq.Session.open("sequences/compact_225.yaml", shots=5) as session:
@@ -204,7 +204,7 @@ class Session(PreparedRun):
         self.earlier = earlier
         self._warnings = warnings
         self.run_dir: Path | None = None
-        # before devices are opened: some vendors' libraries change the working folder
+        # before devices are opened, because some vendors' libraries change the working folder
         self._cwd, self._profile_key = Path.cwd(), assembly.hardware.key
         self._lost = ""
         self._asked: AskedShots | None = None
@@ -225,25 +225,25 @@ class Session(PreparedRun):
         tags: Sequence[str] = (),
         observer: RunObserver | None = None,
     ) -> Session:
-        """Read and check sequence and profile; nothing is opened yet.
+        """Read and check sequence and profile, without opening anything.
 
         Args:
-            sequence: The sequence file, or the name of one in ./sequences or of one that comes with labseq.
-            profile: See :class:`Options`, as for all others.
+            sequence: The sequence file, or the name of a sequence in ./sequences or in labseq.
+            profile: See :class:`Options`, also for all other options.
             shots: Number of shots.
             seed: Seed of the run.
             overrides: ``"address=value"`` strings.
             output: Folder for the data.
             dry_run: "off", "full" or "fast".
             realtime: Let virtual time pass at the speed of real time.
-            note: A note about the run, for people; kept in its folder.
+            note: A note about the run, for people, kept in its folder.
             tags: Words to find the run by.
             observer: Receives every event.
 
         Raises:
-            ConfigError: Sequence, profile or an option has an error; names file, line and column.
-            UnknownPluginError: A plugin that is named does not exist.
-            PluginLoadError: A plugin that is named failed to load.
+            ConfigError: Sequence, profile or an option has an error. The message names file, line and column.
+            UnknownPluginError: A named plugin does not exist.
+            PluginLoadError: A named plugin failed to load.
         """
         folder = None if output is None else path_of(output, "output")
         options = Options(profile, shots, seed, overrides, folder, dry_run, realtime, note, tags)
@@ -266,9 +266,9 @@ class Session(PreparedRun):
 
         Args:
             run: The run's folder or any file in it, or its name or number.
-            shots: Number of shots that the run is to have, more than it was begun with; the run may be
-                complete. A scan begins again with its first point after its last shot.
-            accept_changes: Whether to continue although code, plugins or settings have changed; run.json
+            shots: New number of shots of the run, more than it was begun with. The run may be complete. A
+                scan begins again with its first point after its last shot.
+            accept_changes: Whether to continue although code, plugins or settings have changed. run.json
                 records the changes.
             realtime: Let virtual time pass at the speed of real time.
             observer: Receives every event.
@@ -299,13 +299,13 @@ class Session(PreparedRun):
     ) -> Session:
         """Prepare a new run with the sequence, the profile and the options of an earlier one.
 
-        The texts of the files are those that the earlier run began with, even if the files have changed.
-        Plugins and calibrations are those of today; what differs from the earlier run is a warning.
+        It uses the files' content from the start of the earlier run, even if the files have changed. Plugins
+        and calibrations are today's. Any difference from the earlier run is a warning.
 
         Args:
-            run: The earlier run: its folder or any file in it, its name or number.
+            run: The earlier run, as its folder or any file in it, its name or number.
             same_seed: Whether to take its seed, too.
-            shots, output, realtime, note, tags, observer: See :meth:`open`; by default the note names the
+            shots, output, realtime, note, tags, observer: See :meth:`open`. By default the note names the
                 earlier run.
 
         Raises:
@@ -328,23 +328,23 @@ class Session(PreparedRun):
         self.close()
 
     def close(self) -> None:
-        """End the run of :meth:`shot`; let other processes resume the run. Legal at any time."""
+        """End the run of :meth:`shot`, and let other processes resume the run. Legal at any time."""
         if self._asked is not None:
             self._asked.end()
         if self.earlier is not None:
             self.earlier.release()
 
     def shot(self, values: Mapping[str, Any] | None = None) -> ShotResult:
-        """Take the next shot; the first call opens the devices, and :meth:`close` makes them safe.
+        """Take the next shot. The first call opens the devices, and :meth:`close` makes them safe.
 
-        The run goes on in a thread between the calls, and ends after as many shots as the sequence says.
+        Between the calls the run waits in a thread. It ends after as many shots as the sequence says.
 
         Args:
-            values: Address -> value for this shot; the sequence allows them in `leader: {may_set: [...]}`.
+            values: Address -> value for this shot, as allowed by the sequence in `leader: {may_set: [...]}`.
 
         Raises:
-            ConfigError: A value is wrong or not allowed, and nothing was switched; or no shot is left.
-            LabseqError: The error that ended the run; devices are safe, the data is on disk.
+            ConfigError: No shot is left, or a value is wrong or not allowed. Nothing was switched.
+            LabseqError: The error that ended the run. Devices are safe, and the data is on disk.
         """
         if self._asked is None:
             from labseq.session.asked import AskedShots  # most runs take their shots by themselves
@@ -359,14 +359,14 @@ class Session(PreparedRun):
             The finished run, read back from disk.
 
         Raises:
-            ConfigError: A device would refuse a step; nothing was opened.
-            StopRequested: Ctrl-C or SIGTERM; devices are safe, the data is on disk.
-            LabseqError: The error that ended the run; devices are safe, the data is on disk.
+            ConfigError: A device would refuse a step. Nothing was opened.
+            StopRequested: Ctrl-C or SIGTERM. Devices are safe, and the data is on disk.
+            LabseqError: The error that ended the run. Devices are safe, and the data is on disk.
         """
         if self.run_dir is not None:
             raise ConfigError("a session runs once; open another for the next run")
         if (data_root() / NOTIFY_FILE).is_file():
-            from labseq.session.notices import Notices  # loads what other runs do not need
+            from labseq.session.notices import Notices  # loads modules that other runs do not need
 
             self.observers.add(Notices.read())
         for text in self._warnings:
@@ -398,11 +398,11 @@ class Session(PreparedRun):
         return open_run(self.run_dir)
 
     def _checked(self, first: Point) -> tuple[Lab, list[str]]:
-        """Check the run and compile its kernels; returns the devices of the first shot, and warnings."""
+        """Check the run and compile its kernels. Returns the devices of the first shot, and warnings."""
         warnings = [str(problem) for problem in check(self, runs=True).warnings]
         points = {point.lab_key: point for point in self.points.known(self.history).values()}
         points.pop(first.lab_key, None)
-        # built again: the rehearsal used up random numbers and changed the states of simulated devices
+        # built again, as the rehearsal used up random numbers and changed the states of simulated devices
         self.warm(lab := self.build_lab(first))
         for point in points.values():  # a kernel that is compiled between two shots would hold up the run
             self.warm(self.build_lab(point))
@@ -416,7 +416,7 @@ class Session(PreparedRun):
         settings, target = self.assembly.sequence.policy.checks, self.assembly.target
         self.choose_planner(lab, first)
         before = () if self.earlier is None else self.earlier.rows
-        # in the reverse order of these lines: devices safe, results of analyses waited for, the mark removed
+        # at the end, in reverse order, devices are made safe, analyses are waited for, the mark is removed
         with (
             only_new_garbage(),
             nullcontext() if lab.clock.virtual else real_time(),
@@ -428,10 +428,10 @@ class Session(PreparedRun):
             shots.take_all(checks, self._precision(writer.run_dir, before))
 
     def _precision(self, run_dir: Path, before: Sequence[IndexRow]) -> Precision | None:
-        """What ends the run early; None if its sequence does not ask for it."""
+        """Ends the run early, once the fits are precise. None if its sequence does not ask for it."""
         if not any("stop_when" in measure for measure in self.assembly.resolved["measure"]):
             return None
-        from labseq.session.precision import Precision  # loads what other runs do not need
+        from labseq.session.precision import Precision  # loads modules that other runs do not need
 
         return Precision(self.assembly, run_dir, before, self.stop_flag, self.warn)
 
@@ -439,14 +439,14 @@ class Session(PreparedRun):
     def _folder(
         self, first: Point, reading: Future[RunCode], describe_locks: Callable[[str], None]
     ) -> Generator[tuple[RunRecord, RunWriter]]:
-        """The run's folder, in which the way that the block ends is recorded."""
+        """Make the run's folder, and record there how the block ends."""
         record, writer = self._begin(first, reading)
         describe_locks(f"the run {writer.run_dir}")
         error: BaseException | None = None
         with self.observers.logged_by(writer.event):
             if self.earlier is None and (day := later_day(writer.run_dir)):
                 self.warn(
-                    f"the clock may be wrong: {visible(str(self.root))} has runs of {day}, after this one"
+                    f"the clock may be wrong, because {visible(str(self.root))} has later runs, of {day}"
                 )
             try:
                 yield record, writer
@@ -482,7 +482,7 @@ class Session(PreparedRun):
 
     @contextmanager
     def _devices(self, sequencer: Sequencer, record: RunRecord, writer: RunWriter) -> Generator[None]:
-        """Open the devices; whatever ends the block, they are safe and closed first of all.
+        """Open the devices. However the block ends, they are made safe and closed first.
 
         Raises:
             DeviceError: The watchdog was lost, or a device is not safe after the block has ended well.
@@ -505,7 +505,7 @@ class Session(PreparedRun):
             raise DeviceError(next(iter(unsafe)), f"not in its safe state after the run: {reasons}")
 
     def _end_without_watchdog(self, why: str) -> None:
-        """Have the run end; called by the thread of the heartbeat."""
+        """Make the run end. Called by the thread of the heartbeat."""
         self._lost = why
         self.stop_flag.request(signal.SIGTERM)
 
@@ -517,7 +517,7 @@ class Session(PreparedRun):
         return code
 
     def _begin(self, first: Point | None, reading: Future[RunCode]) -> tuple[RunRecord, RunWriter]:
-        """Create the run's folder, or reopen that of a resumed run; ``first`` is its next point, if any."""
+        """Create the run's folder, or reopen a resumed run's folder. ``first`` is its next point, if any."""
         changes, earlier, code = self.options.changes(), self.earlier, reading.result()
         if not code.is_of(self.assembly.hardware.host):  # a planner that was constructed uses another's
             code = code_of(self.assembly, self._cwd)
@@ -534,7 +534,7 @@ class Session(PreparedRun):
         return record, writer
 
     def _report_best(self, run_dir: Path) -> None:
-        """Record the best point of an adaptive scan, with its value and the suggested one."""
+        """Record the best point of an adaptive scan, with its value and the suggested values."""
         from labseq.data.best import best_point  # only adaptive scans have one
 
         best = best_point(open_run(run_dir))
@@ -542,7 +542,7 @@ class Session(PreparedRun):
             self.observers.event("scan_result", best.as_json())
 
     def _try(self, act: Callable[P, None], *args: P.args, **kwargs: P.kwargs) -> None:
-        """Write to disk at the end of a run; a full disk must not hide the error that ended the run."""
+        """Write to disk at the end of a run. A full disk must not hide the error that ended the run."""
         try:
             act(*args, **kwargs)
         except Exception as failure:  # noqa: BLE001 - nothing hides the error that ended the run
@@ -550,10 +550,10 @@ class Session(PreparedRun):
 
 
 def _notes_file(note: str, tags: Sequence[str]) -> dict[str, bytes]:
-    """The note about a run and its tags as a file for the run's folder; {} without any.
+    """The note about a run and its tags as a file for the run's folder. {} without any.
 
     Raises:
-        ConfigError: One is too long.
+        ConfigError: The note or a tag is too long.
     """
     if not (note or tags):
         return {}

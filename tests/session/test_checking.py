@@ -68,7 +68,7 @@ def test_a_run_takes_as_long_as_the_check_predicts(tmp_path: Path):
         ("shot.2.rearrange.window=30 ms", "too short for most plans"),
         (
             "shot.2.rearrange={cycles: 2, window: [60 ms, 10 ms]}",
-            "a window of 10 ms is over before the first",
+            "a window of 10 ms ends before the first",
         ),
         ("profile.simulation.loading=0.5", "loadings have enough atoms for the target"),
         (
@@ -98,7 +98,7 @@ REAL = "profile.camera={use: genicam, camera: 10.0.0.7, region: {y: 0, x: 0, hei
         ),
         ([LINES % ", blinding: false", "profile.camera.em_gain=50"], []),
         ([LINES % ""], []),
-        ([REAL], ["nothing of this profile switches the imaging light"]),
+        ([REAL], ["nothing in this profile switches the imaging light"]),
         ([REAL, LINES % ""], []),
         ([REAL, "shot=[{load: {}}]"], []),
     ],
@@ -253,6 +253,6 @@ def test_a_driver_or_step_that_fails_to_check_a_step_has_the_place_of_the_step(t
         check(session)
     first, second = (str(problem) for problem in caught.value.problems)
     line = text[: text.index("- choosy")].count("\n") + 1
-    assert f"s.yaml:{line}:13: check_devices() of step 'choosy' returned no mapping" in first
+    assert f"s.yaml:{line}:13: check_devices() of step 'choosy' did not return a mapping" in first
     assert f"s.yaml:{line + 1}:33: shutter: check_command() raised TypeError" in second
     assert "'volts'" in second

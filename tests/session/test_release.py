@@ -67,7 +67,7 @@ def test_a_wait_that_is_kept_roughly_is_a_warning_of_check_and_run(tmp_path: Pat
     with labseq.Session.open(path, profile="virtual", output=tmp_path, shots=1, observer=observer) as session:
         (warning,) = check(session).warnings
         session.run()
-    assert "cannot time 5 ms exactly: it may last about 1 ms longer" in str(warning)
+    assert "cannot time 5 ms exactly, so it may last about 1 ms longer" in str(warning)
     assert [values["text"] for values in observer.of("warning")] == [str(warning)]
     (late,) = check(labseq.Session.open(path, profile="lab")).warnings
     assert "about 31 ms longer, because 'ramp to 1' begins late at the outputs of 'static" in late.what
