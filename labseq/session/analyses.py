@@ -1,9 +1,9 @@
-"""Analyses of a run: constructed from its settings, applied to its shots, here or in a process beside it.
+"""Constructs the analyses of a run and applies them to its shots, here or in a separate process.
 
-``python -m labseq.session.analyses RUN_DIR NAME FINISH_WITHIN`` is the process of one analysis. It reads the
-run's index, which lists a shot as soon as it is complete on disk: the index is the queue. So the run never
-waits for an analysis, an analysis that falls behind takes no memory, and one that is restarted continues
-where it was. The end of standard input signals the end of the run.
+``python -m labseq.session.analyses RUN_DIR NAME FINISH_WITHIN`` is the process of one analysis. Its queue is
+the run's index, which lists a shot as soon as it is complete on disk. So the run never waits for an analysis,
+an analysis that falls behind takes no memory, and a restarted analysis continues where it was. The end of
+standard input signals the end of the run.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class PreparedAnalysis:
     Attributes:
         name: Its name.
         analysis: The analysis itself.
-        about: Plugin, version and settings, as the file of the results has them.
+        about: Plugin, version and settings, for the file of the results.
     """
 
     name: str
@@ -53,7 +53,7 @@ class PreparedAnalysis:
 
 @dataclass(frozen=True, slots=True)
 class AnalysisOutcome:
-    """What an analysis has done: number of shots analysed, failures, and the file of the results.
+    """The outcome of an analysis, with the number of analysed shots, the failures, and the results file.
 
     Attributes:
         name: Its name.
@@ -137,7 +137,7 @@ def analyse(
     log: ResultsLog,
     failed: Callable[[int, BaseException], None],
 ) -> int:
-    """Analyse shots; a failure is recorded and reported, and the next shot follows.
+    """Analyse shots. A failure is recorded and reported, and the next shot follows.
 
     Args:
         failed: Receives the index of a failed shot, and the error.
@@ -166,7 +166,7 @@ def analyse_missing(run: Run, settings: Mapping[str, Any], *, again: bool = Fals
 
     Raises:
         ConfigError: A setting is invalid, or another process writes the same results.
-        LabseqError: See :func:`prepare`; or the disk is full.
+        LabseqError: As for :func:`prepare`, or the disk is full.
     """
     prepared = prepare(run, settings)
     failures: dict[int, str] = {}
@@ -219,7 +219,7 @@ class _End:
 
     @property
     def time_is_up(self) -> bool:
-        """Whether the time after the run is used up: no further shot is analysed."""
+        """Whether the time after the run is used up, so that no further shot is analysed."""
         return time.monotonic() > self._deadline_s
 
     def wait(self) -> None:
@@ -271,7 +271,7 @@ def _report(shot: int, error: BaseException) -> None:
 
 
 if __name__ == "__main__":
-    # in the log, what an analysis prints and its errors keep their order
+    # so that the output and the errors of an analysis keep their order in the log
     cast("io.TextIOWrapper", sys.stdout).reconfigure(line_buffering=True)
     try:
         main(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]))

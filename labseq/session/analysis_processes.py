@@ -50,15 +50,15 @@ Rows = Mapping[int, Mapping[str, Any]]
 
 
 class AnalysisProcesses(Analyses):
-    """The analyses of a run's shots: they neither stop nor slow it, unless it needs their results.
+    """The analyses of a run's shots, which neither stop nor slow the run unless it needs their results.
 
-    An adaptive scan or a check may need a result: the run then waits for it between two shots. The results
-    that were used are in the event log. A resumed run takes them from there: it decides as before, even if a
-    result came too late or was computed again since.
+    If an adaptive scan or a check needs a result, the run waits for it between two shots. The results that
+    were used are in the event log. A resumed run takes them from there, so that it decides as before, even if
+    a result came too late or was computed again since.
 
     Args:
-        analyses: The analyses of the sequence: "use" and "finish_within" of each.
-        needed: Quantity of an analysis -> what for, if the run cannot go on without it, else "".
+        analyses: "use" and "finish_within" of each analysis of the sequence.
+        needed: Quantity of an analysis -> its purpose if the run cannot continue without it, else "".
         observer: Receives warnings and the results that are used.
         stop: The request to stop, which ends a wait.
         run: The run, if it is resumed.
@@ -90,7 +90,7 @@ class AnalysisProcesses(Analyses):
                 self.values[used["quantity"]].update(zip(used["shots"], used["values"], strict=True))
 
     def start(self, run_dir: Path) -> None:
-        """Start their processes; from now on results are taken from these."""
+        """Start their processes, from which all results are taken from now on."""
         self._run_dir = run_dir
         for analysis in self._analyses:
             if (process := self._started(run_dir, analysis)) is not None:
@@ -99,12 +99,12 @@ class AnalysisProcesses(Analyses):
             self._observer.event(_USED, used)
 
     def look(self) -> None:
-        """Warn once about each analysis that has failed; fast enough to call between shots."""
+        """Warn once about each analysis that has failed. Fast enough to call between shots."""
         for process in self._processes.values():
             process.look(self._warn)
 
     def finish(self) -> None:
-        """After the run: give each analysis time for the remaining shots, then report missing results."""
+        """Give each analysis time for the remaining shots after the run, then report missing results."""
         # first ask all of them to end, so that they work through their last shots at the same time
         for process in self._processes.values():
             process.end_of_run()
@@ -118,7 +118,7 @@ class AnalysisProcesses(Analyses):
         """Wait until the values of a quantity are known, if it is a result.
 
         Raises:
-            DeviceError: The analysis has ended, and the run cannot go on without it.
+            DeviceError: The analysis has ended, and the run cannot continue without it.
             RecordingError: Its results cannot be read.
             StopRequested: The run was asked to stop.
         """
@@ -138,7 +138,7 @@ class AnalysisProcesses(Analyses):
                 self._observer.event(_USED, used)
 
     def _rows(self, analysis: Mapping[str, Any], shots: Collection[int]) -> tuple[Rows, bool]:
-        """The results of shots that come in time, and whether more can come."""
+        """The results of these shots that arrive in time, and whether more can arrive."""
         if self._run_dir is not None:
             process = self._processes.get(str(analysis[USE]))
             return ({}, False) if process is None else process.wait_for(shots, self._stop)
@@ -171,7 +171,7 @@ class AnalysisProcesses(Analyses):
                 self._warn(f"{text}; 'labseq analyse {self._run_dir}' computes the missing results")
 
     def _value(self, name: str, shot: int, row: Mapping[str, Any] | None) -> float | None:
-        """The value in a row of the results; None, with a warning, if it has none."""
+        """The value in a row of the results. None, with a warning, if it has none."""
         analysis = self._analysis[name]
         prefix = f"{RESULT_PREFIX}{analysis[USE]}."
         value = None if row is None else row.get(name.removeprefix(prefix))
@@ -226,7 +226,7 @@ class _AnalysisProcess:
             )
 
     def look(self, warn: Callable[[str], None]) -> None:
-        """Report the first failure; the log of the analysis lists all of them."""
+        """Report the first failure. The log of the analysis lists all of them."""
         if self._has_warned:
             return
         code = self._process.poll()
@@ -240,10 +240,10 @@ class _AnalysisProcess:
                 self._has_warned = True
 
     def wait_for(self, shots: Collection[int], stop: StopFlag) -> tuple[Rows, bool]:
-        """Wait until there are results of shots, at most ``finish_within`` from the start of the process.
+        """Wait for the results of shots, at most ``finish_within`` from the start of the process.
 
         Returns:
-            Shot -> its row, without those that did not come in time; and whether more can come.
+            Shot -> its row if that arrived in time, and whether more can arrive.
 
         Raises:
             RecordingError: The results cannot be read.
@@ -253,8 +253,8 @@ class _AnalysisProcess:
         while True:
             is_running, now_s = self._process.poll() is None, time.monotonic()
             self._results.read()
-            # the time that it has begins with its first result: starting takes seconds
-            # time for the process of an analysis to start, before it counts as late, in seconds
+            # its time begins with its first result, or 60 s after its start at the latest, because
+            # starting takes seconds
             if self._size() == self._size_before and now_s < self._start_s + 60.0:
                 asked_s = now_s
             found = {shot: self._results.rows[shot] for shot in shots if shot in self._results.rows}
@@ -284,7 +284,7 @@ class _AnalysisProcess:
             self._process.kill()
             self._process.wait()
             within = format_quantity(self._finish_within_s, "time")
-            warn(f"analysis '{self.name}' did not finish within {within} after the run, and was ended")
+            warn(f"analysis '{self.name}' did not finish within {within} after the run and was ended")
             self._has_warned = True
         self.look(warn)
         with suppress(OSError):
@@ -309,6 +309,6 @@ def _flags() -> int:
 
 
 def _analysis_of(name: str, analyses: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """The analysis whose results a quantity is one of."""
+    """The analysis that computes a quantity."""
     use, _ = split_result(name) or ("", "")
     return next(analysis for analysis in analyses if analysis[USE] == use)

@@ -22,29 +22,29 @@ if TYPE_CHECKING:
 
 
 class Analyses:
-    """The analyses of a run's shots: of a run that has none; see :class:`AnalysisProcesses`.
+    """The interface of :class:`AnalysisProcesses`, for a run without analyses.
 
     Attributes:
-        values: Quantity -> shot -> value; None for a shot without one.
+        values: Quantity -> shot -> value, or None for a shot without a value.
     """
 
     def __init__(self) -> None:
         self.values: dict[str, dict[int, float | None]] = {}
 
     def start(self, run_dir: Path) -> None:
-        """Start them; from now on results are taken from these."""
+        """Start the analyses, from which all results are taken from now on."""
 
     def look(self) -> None:
-        """Warn once about each analysis that has failed; fast enough to call between shots."""
+        """Warn once about each analysis that has failed. Fast enough to call between shots."""
 
     def finish(self) -> None:
-        """After the run: give each analysis time for the remaining shots, then report missing results."""
+        """Give each analysis time for the remaining shots after the run, then report missing results."""
 
     def await_shots(self, name: str, shots: Sequence[int]) -> None:
         """Wait until the values of a quantity are known, if it is a result.
 
         Raises:
-            DeviceError: The analysis has ended, and the run cannot go on without it.
+            DeviceError: The analysis has ended, and the run cannot continue without it.
             RecordingError: Its results cannot be read.
             StopRequested: The run was asked to stop.
         """
@@ -141,7 +141,7 @@ def _missing(check: CheckSettings, row: IndexRow) -> str:
 
 
 def _failure(check: CheckSettings, values: deque[float]) -> str:
-    """The message if the mean of the last values is out of range, or ""; shots without one are left out."""
+    """The message if the mean of the last values is out of range, or "". Missing values are skipped."""
     known = [value for value in values if not np.isnan(value)]
     if len(values) < check.shots or not known:
         return ""

@@ -1,4 +1,4 @@
-"""Shots with values that another control system sends: their settings, checked, ready when `go` comes."""
+"""Checked settings for shots with values of another control system, ready when `go` comes."""
 
 from __future__ import annotations
 
@@ -18,20 +18,19 @@ from labseq.session.check import check_settings
 from labseq.session.prepared import PreparedRun
 
 _N_KEPT: Final = 64
-"""Settings and planners that are kept; a scan comes back to the same ones."""
+"""Number of settings and planners that are kept, because a scan comes back to the same values."""
 
 
 class LedShots:
     """Makes the settings of a shot from the values that another control system has sent.
 
-    The objects that the values do not change are those of the run, so that only what differs is built. It may
-    be called from any thread.
+    It reuses the run's objects that the values do not change. It may be called from any thread.
 
     Args:
         run: The run.
-        points: What may be set.
+        points: Makes the points, and knows which settings may be set.
         lab: The devices, with the planner of the files.
-        others: The parameters of every shot: address -> value.
+        others: The parameters of every shot, address -> value.
     """
 
     def __init__(self, run: PreparedRun, points: LedPoints, lab: Lab, others: Mapping[str, Any]) -> None:
@@ -61,7 +60,7 @@ class LedShots:
         _, lab = _kept(self._labs, id(point.planner), lambda: (point, self._rebuilt(point)))
         lab = replace(lab, target=point.target or lab.target)
         timelines = check_settings(self._run, self._guard, point, lab)
-        self._run.choose(lab, point.steps)  # a planner that chooses recalls what it has chosen before
+        self._run.choose(lab, point.steps)  # a planner that chooses recalls its earlier choice
         return ShotSettings(lab, point.steps, timelines, {**self._others, **point.parameters})
 
     def _rebuilt(self, point: Point) -> Lab:
@@ -73,7 +72,7 @@ class LedShots:
 
 
 def _kept(kept: OrderedDict[Any, Any], key: object, make: Callable[[], Any]) -> Any:
-    """What was made for a key, or is made now; the oldest but the first is forgotten when there are many."""
+    """The object for a key, made if needed. If there are many, the oldest but the first is forgotten."""
     if key not in kept:
         kept[key] = make()
         if len(kept) > _N_KEPT:

@@ -1,6 +1,6 @@
-"""Notices to people who are not in the lab: what ``notify.yaml`` in the data folder asks for.
+"""Notices to people who are not in the lab, as set up in ``notify.yaml`` in the data folder.
 
-A notice is sent by a process of its own, so that neither a slow network nor a program that hangs delays a
+Each notice is sent by a separate process, so that neither a slow network nor a program that hangs delays a
 shot, and so that it is sent even if this process ends meanwhile.
 """
 
@@ -50,7 +50,7 @@ class NoticeSettings(Settings):
         description="a run has failed, an alarm has begun, the disk is nearly full, the queue has ended",
     )
     free_gb: float = Field(
-        default=FREE_GB, gt=0, description="fewer GB than this are free: 'disk', and an alarm of the page"
+        default=FREE_GB, gt=0, description="free GB below which 'disk' is sent and the page gives an alarm"
     )
 
     @field_validator("webhook")
@@ -61,7 +61,7 @@ class NoticeSettings(Settings):
 
     @classmethod
     def read(cls, root: Path) -> Self | None:
-        """The settings in a data folder; None without a file.
+        """The settings in a data folder. None without a file.
 
         Raises:
             ConfigError: The file has an error.
@@ -70,16 +70,16 @@ class NoticeSettings(Settings):
         return Document.read(path).validate(cls) if path.is_file() else None
 
     def task(self, kind: str, run: str, text: str) -> dict[str, Any]:
-        """What :func:`labseq.session.send_notice.send` is to do."""
+        """The task for :func:`labseq.session.send_notice.send`."""
         notice = {"kind": kind, "run": run, "text": f"labseq: {f'{run}: ' if run else ''}{text}"}
         return {"command": self.command, "webhook": self.webhook, "notice": notice}
 
 
 class Notices:
-    """Implements ``RunObserver``: sends a notice of each event that somebody wants to know.
+    """Implements ``RunObserver``. Sends a notice of each event that the settings ask for.
 
     Args:
-        settings: Whom to send what; None to send nothing.
+        settings: Receivers and events. None to send nothing.
         root: The data folder.
 
     Attributes:
@@ -94,7 +94,7 @@ class Notices:
 
     @classmethod
     def read(cls) -> Self:
-        """As the file in the data folder asks; without one, nothing is sent.
+        """Notices as set up by the file in the data folder. Without a file, nothing is sent.
 
         Raises:
             ConfigError: The file has an error.
@@ -103,7 +103,7 @@ class Notices:
         return cls(NoticeSettings.read(root), root)
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Send a notice if the event is one that is wanted."""
+        """Send a notice if the settings ask for this event."""
         if self.settings is None:
             return
         match name:
@@ -125,7 +125,7 @@ class Notices:
         free = free_bytes(self._run_dir)
         if free < free_gb * 1e9:
             self._next_look_s = float("inf")  # once in a run
-            self.send("disk", f"{size_text(free)} are free on the disk of {visible(str(self._run_dir))}")
+            self.send("disk", f"only {size_text(free)} are free on the disk of {visible(str(self._run_dir))}")
 
     def send(self, kind: NoticeKind, text: str) -> None:
         """Send a notice, if its kind is wanted."""
@@ -136,7 +136,7 @@ class Notices:
 
 
 def deliver(root: Path, task: Mapping[str, Any]) -> None:
-    """Start the process that sends a notice; it is not waited for."""
+    """Start the process that sends a notice, without waiting for it."""
     process = subprocess.Popen(
         [sys.executable, "-m", "labseq.session.send_notice"],
         stdin=subprocess.PIPE,

@@ -20,11 +20,11 @@ _HOOKS: Final = {  # event -> observer hook of plugins, and the event's values t
     "run_finished": ("labseq_run_finished", {"run": "record"}),
 }
 MAX_WAIT_S: Final = 5.0
-"""Maximum time for a plugin's observer hook, in seconds; a slower one is not called again in the run."""
+"""Maximum time for a plugin's observer hook, in seconds. A slower hook is not called again in the run."""
 
 
 class Observers:
-    """Implements ``RunObserver`` for the sequencer; no failure of a receiver stops the run."""
+    """Implements ``RunObserver`` for the sequencer. No failure of a receiver stops the run."""
 
     def __init__(self, host: PluginHost, observer: RunObserver | None) -> None:
         self._host = host
@@ -35,7 +35,7 @@ class Observers:
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         """Pass an event on to every receiver."""
-        # the log first: neither a plugin nor a screen may keep an event out of it
+        # the log first, because no plugin or screen may keep an event out of it
         self._write(name, values)
         self._notify(name, values)
         self._show(name, values)
@@ -46,7 +46,7 @@ class Observers:
 
     @contextmanager
     def logged_by(self, log: Callable[..., None]) -> Generator[None]:
-        """Write the events of the block to the log of the run: ``log(name, **values)``."""
+        """Write the events of the block to the log of the run with ``log(name, **values)``."""
         self._log = log
         try:
             yield
@@ -66,7 +66,7 @@ class Observers:
             if plugin in self._hung:
                 continue
             try:
-                # despite a stop request: plugins learn of the end of a run that was stopped, too
+                # despite a stop request, because plugins also learn of the end of a stopped run
                 self._guard.call_despite_stop(plugin, MAX_WAIT_S, call)
             except LabseqError as error:
                 if isinstance(error, DeviceTimeoutError):
@@ -81,7 +81,7 @@ class Observers:
                 receiver.event(name, values)
             except BaseException as error:  # noqa: BLE001 - a broken screen must not stop the run
                 self._receivers.remove(receiver)
-                which = f"{type(receiver).__name__} failed and is off"
+                which = f"{type(receiver).__name__} failed and was switched off"
                 self._write("warning", {"text": f"{which}: {format_error(error)}"})
 
     def _write(self, name: str, values: Mapping[str, Any]) -> None:

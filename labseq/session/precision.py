@@ -1,7 +1,7 @@
 """Ends a run before its last shot, when its fits are as precise as its sequence asks (``stop_when``).
 
-The fits are made between two shots: those of labseq's own models take milliseconds, and the run ends at the
-same shot whenever it is repeated with its seed.
+The fits are made between two shots, so that the run ends at the same shot whenever it is repeated with its
+seed. Fits of labseq's own models take milliseconds.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MAX_FIT_S: Final = 10.0
 
 
 class _Aim(NamedTuple):
-    """A quantity whose fits are to reach some errors: parameter -> error, as written."""
+    """A quantity whose fits must reach certain errors, given as parameter -> error, as written."""
 
     series: Series
     request: FitRequest
@@ -90,7 +90,7 @@ class Precision:
         for aim in self._aims:
             call = self._guard.run("fit", MAX_FIT_S, partial(self._results, aim))
             if call is None:
-                self._give_up(f"the fit {aim.request.model} has not ended after {MAX_FIT_S:.0f} s")
+                self._give_up(f"the fit {aim.request.model} did not end within {MAX_FIT_S:.0f} s")
                 return ""
             if (error := call.error) is not None:
                 if isinstance(error.__cause__, PluginLoadError):
@@ -103,17 +103,17 @@ class Precision:
         return f"stop_when reached: {', '.join(results)}" if all(results) else ""
 
     def _takes_turn(self) -> bool:
-        """Whether the fits are made now, after a whole round of the points; if so, sets when the next are."""
+        """Whether the fits are made now, after a whole round of the points. If so, sets the next time."""
         is_due = self._n_shots >= self._next and not self._n_shots % len(self._points)
         if is_due:
-            # growth of the number of shots between two fits: 5 % more shots reduce an error by 2.5 %, and a
-            # run of many shots makes only some dozens of fits
+            # 5 % more shots until the next fit, which reduce an error by 2.5 %, so that a run of many shots
+            # makes only some dozens of fits
             self._next = 1.05 * self._n_shots
         return is_due
 
     def _give_up(self, why: str) -> None:
         self._next = math.inf
-        self._warn(f"the run takes all its shots, whatever 'stop_when' says: {why}")
+        self._warn(f"'stop_when' is ignored, and the run takes all its shots: {why}")
 
     def _add(self, row: IndexRow) -> None:
         if not row.counts:
@@ -124,7 +124,7 @@ class Precision:
             aim.series.add(row)
 
     def _results(self, aim: _Aim) -> list[str]:
-        """What is known of each parameter, for each fit; "" where it is not precise enough."""
+        """Each parameter with its error, for each fit. "" where it is not precise enough."""
         aim.series.read_results()
         means = aim.series.over([self._lines[i] for i in range(len(self._points))])
         scan = on_axes(self._run.scan, self._points)
@@ -142,7 +142,7 @@ def _aim(assembly: Assembly, run_dir: Path, number: int, measure: Mapping[str, A
 
 
 def _known(fit: Fit | None, name: str, written: float | str) -> str:
-    """A parameter with its error, if the points follow the model and the error is reached; else ""."""
+    """A parameter with its error, if the points follow the model and the error is reached, else ""."""
     if fit is None or not follows(fit):
         return ""
     parameter = fit.parameters[name]

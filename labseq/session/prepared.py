@@ -1,4 +1,4 @@
-"""A run before its devices are opened, as `labseq check` and a session use it: its shots and their points."""
+"""A run before its devices are opened, with its shots and points, for `labseq check` and sessions."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from labseq.session.rehearsal import first_window_s
 
 
 class History:
-    """The shots of a run: those that were taken or given up, and those still to take.
+    """The shots of a run, both the shots that were taken or given up and the shots still to take.
 
     Args:
-        run: The run before it was resumed; None for a new one.
+        run: The run before it was resumed. None for a new run.
         done: Its shots that are not taken again.
 
     Attributes:
         point_of_shot: Number of the point of each shot of the run.
         to_take: Shots still to take, in order.
-        last: The shot added last; None before the first one of this process.
-        shots: Number of a point -> index of a shot -> the shots taken there that count; of an adaptive scan.
-        given_up: Number of a point -> a shot that was given up there; likewise.
+        last: The shot added last. None before the first shot of this process.
+        shots: Number of a point -> index of a shot -> the shot, if it counts. Only for adaptive scans.
+        given_up: Number of a point -> a shot that was given up there. Only for adaptive scans.
     """
 
     def __init__(self, assembly: Assembly, seed: int, run: Run | None, done: Collection[int]) -> None:
@@ -54,14 +54,14 @@ class History:
 
     @property
     def next_number(self) -> int | None:
-        """Number of the point of the next shot; None if no shot is left."""
+        """Number of the point of the next shot. None if no shot is left."""
         return self.point_of_shot[self.to_take[0]] if self.to_take else None
 
     def add(self, run_dir: Path, row: IndexRow) -> None:
         """Add the next shot, which was taken or given up."""
         self.last = row.shot
         self.to_take.remove(row.shot)
-        if not self._is_search:  # nothing depends on the lines; those of a long run would fill the memory
+        if not self._is_search:  # nothing depends on the lines, and in a long run they would fill the memory
             return
         number = self.point_of_shot[row.shot]
         if row.counts:
@@ -75,17 +75,17 @@ class History:
         self.to_take = [shot for shot in self.to_take if shot not in skipped]
 
     def later_at_its_point(self, shot: int) -> list[int]:
-        """Shots still to take at the point of a shot; none without a scan, where each shot is separate."""
+        """Shots still to take at the point of a shot. Empty without a scan, where each shot is separate."""
         number = self.point_of_shot[shot]
         is_there = (later for later in self.to_take if later > shot and self.point_of_shot[later] == number)
         return [*is_there] if self._is_scan else []
 
 
 class Points(Protocol):
-    """Says where the shots of a run are taken."""
+    """Gives the point of each shot of a run."""
 
     def next(self, history: History) -> Point | None:
-        """The point of the next shot, the same object for following shots of a point; None to end the run.
+        """The point of the next shot, the same object for all shots of a point. None to end the run.
 
         Raises:
             DeviceError: A scanner failed.
@@ -94,18 +94,18 @@ class Points(Protocol):
         ...
 
     def known(self, history: History) -> Mapping[int, Point]:
-        """The points that can be checked before the run: number -> point."""
+        """The points that can be checked before the run, number -> point."""
         ...
 
 
 class ListedPoints:
-    """Points that are known in advance; without a scan, the settings of the files."""
+    """Points that are known in advance. Without a scan, this is the settings of the files."""
 
     def __init__(self, assembly: Assembly) -> None:
         self._at = cache(assembly.at)  # the same object for the same point, so that nothing is built again
 
     def next(self, history: History) -> Point | None:
-        """The point of the next shot; None after the last one."""
+        """The point of the next shot. None after the last shot."""
         return None if history.next_number is None else self._at(history.next_number)
 
     def known(self, history: History) -> Mapping[int, Point]:
@@ -120,7 +120,7 @@ class PreparedRun:
         paced: Let virtual time pass at the speed of real time.
         observer: Receives every event.
         root: The folder for the data.
-        run: The run as it was before, if it is resumed; else None.
+        run: The earlier run, if it is resumed, else None.
         done: Its shots that are not taken again.
 
     Attributes:
@@ -129,8 +129,8 @@ class PreparedRun:
         stop_flag: The request to stop it.
         observers: Receive its events.
         analyses: The analyses of its shots.
-        history: The shots that were taken, and those still to take.
-        points: Says where they are taken.
+        history: The shots that were taken, and the shots still to take.
+        points: Gives the point of each shot.
         root: The folder for the data, absolute.
     """
 
@@ -154,26 +154,26 @@ class PreparedRun:
         self.history = History(assembly, self.seed, run, done)
         self.points: Points = ListedPoints(assembly)
         if assembly.search is not None:
-            from labseq.session.adaptive import SearchedPoints  # loads what other runs do not need
+            from labseq.session.adaptive import SearchedPoints  # loads modules that other runs do not need
 
             self.points = SearchedPoints(self, assembly.search)
         self._is_paced = paced
 
     def build_lab(self, point: Point | None = None) -> Lab:
-        """Construct the object of every role with the run's clock; no device is opened.
+        """Construct the object of every role with the run's clock, without opening a device.
 
         Args:
-            point: Point of the scan; None for the first one.
+            point: Point of the scan. None for the first point.
         """
         clock = clock_for(self.stop_flag, virtual=self.assembly.virtual_time, paced=self._is_paced)
         return build_lab(point or self.assembly.first_point, self.assembly.target, clock, self.seed)
 
     def warm(self, lab: Lab, *, devices: bool = True) -> None:
-        """Compile the kernels of a lab; see :func:`labseq.assembly.lab.warm`."""
+        """Compile the kernels of a lab. See :func:`labseq.assembly.lab.warm`."""
         warm(lab, self.stop_flag, self.observers, devices=devices)
 
     def choose(self, lab: Lab, steps: Sequence[tuple[str, Step]]) -> Sequence[str]:
-        """What a planner that chooses how it plans has chosen, then the alternatives; it may take seconds.
+        """The choice of a planner that chooses how to plan, then the alternatives. May take seconds.
 
         Empty if the planner has no choice, or nothing is planned.
         """
@@ -181,7 +181,7 @@ class PreparedRun:
         return () if window_s is None else choice_of(lab.planner, lab.target, window_s, self.stop_flag)
 
     def choose_planner(self, lab: Lab, point: Point) -> None:
-        """Let a planner that chooses how it plans do so, and log it."""
+        """Let a planner that chooses how to plan do so, and log the choice."""
         if chosen := self.choose(lab, point.steps):
             self.observers.event("planner_chosen", {"chosen": [*chosen]})
 
@@ -190,8 +190,8 @@ class PreparedRun:
         self.observers.event("warning", {"text": text})
 
     def _analysis_processes(self, run: Run | None) -> Analyses:
-        """The analyses of the sequence, and what the run needs of their results."""
-        from labseq.session.analysis_processes import AnalysisProcesses  # loads what other runs do not need
+        """The analyses of the sequence, with the results that the run needs."""
+        from labseq.session.analysis_processes import AnalysisProcesses  # other runs do not need its modules
 
         checks, search = self.assembly.sequence.policy.checks, self.assembly.search
         needed = {check.value: "" for check in checks}

@@ -1,4 +1,4 @@
-"""The record that a run starts with: settings, code versions, host and installed packages."""
+"""The initial record of a run, with settings, code versions, host and installed packages."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Setting(NamedTuple):
     """A value as it is recorded.
 
     Attributes:
-        value: SI, JSON-ready.
-        unit: SI unit; "" for none.
-        written: As it was typed.
+        value: The value in SI, JSON-ready.
+        unit: SI unit, or "" for none.
+        written: The value as it was typed.
     """
 
     value: Any
@@ -50,7 +50,7 @@ def gather_provenance(git: Mapping[str, Any]) -> dict[str, Any]:
         git: States of the repositories of labseq's own code and of the sequence.
 
     Returns:
-        JSON-ready values: labseq, python, platform, host, user, git, packages.
+        JSON-ready values of labseq, python, platform, host, user, git and packages.
     """
     return {
         "labseq": labseq.__version__,
@@ -66,7 +66,7 @@ def gather_provenance(git: Mapping[str, Any]) -> dict[str, Any]:
 
 @functools.cache
 def _packages() -> dict[str, str]:
-    """Name -> version of each installed package; read only once, because it takes as long as a short shot."""
+    """Name -> version of each installed package. Read only once, because it takes as long as a short shot."""
     packages = [name_and_version(distribution) for distribution in distributions()]
     return {name: version for name, version in packages if name}
 
@@ -79,7 +79,7 @@ def _user() -> str:
 
 
 def code_of(assembly: Assembly, folder: Path, also: Collection[str] = ()) -> RunCode:
-    """The code of a run; ``folder`` is the working folder; for ``also`` see :func:`gather_code`."""
+    """The code of a run. ``folder`` is the working folder. For ``also`` see :func:`gather_code`."""
     return gather_code(assembly.hardware.host, (folder / assembly.document.path).parent, also)
 
 
@@ -89,8 +89,8 @@ def run_record(
     """The record of a run before anything is opened.
 
     Args:
-        changes: Changes by options, as they were typed: address -> value.
-        folder: The working folder, absolute: relative paths in the settings are relative to it.
+        changes: Changes by options, as they were typed, address -> value.
+        folder: The absolute working folder, to which relative paths in the settings refer.
         code: Its code.
     """
     spec, hardware = assembly.sequence, assembly.hardware
@@ -126,12 +126,12 @@ def run_record(
 
 
 def _setting(assembly: Assembly, address: str, written: str = "") -> Setting:
-    """A setting of the run, after defaults and overrides; the scan is at its first point.
+    """A setting of the run, after defaults and overrides, at the first point of a scan.
 
     Args:
         assembly: The run.
-        address: Its address; "profile." for one in the profile.
-        written: What was typed for it: taken if the record has no such setting.
+        address: Its address, which begins with "profile." for a setting of the profile.
+        written: Its value as typed, used if the record has no such setting.
     """
     if address in NOT_SET:
         return Setting(written, "", written)
@@ -142,13 +142,13 @@ def _setting(assembly: Assembly, address: str, written: str = "") -> Setting:
         value: Any = assembly.resolved["profile"] if of_profile else assembly.resolved
         for key in loc:
             value = value[key]
-    except (ConfigError, LookupError, TypeError):  # a setting that is written and not used
+    except (ConfigError, LookupError, TypeError):  # a setting that is written but not used
         return Setting(written, "", written)
     return Setting(value, _unit(assembly, loc, of_profile=of_profile) or si_unit_of(written), written)
 
 
 def _unit(assembly: Assembly, loc: Loc, *, of_profile: bool) -> str:
-    """SI unit of a setting of a plugin or of the core; "" if it has none."""
+    """SI unit of a setting of a plugin or of the core, or "" if it has none."""
     core = type(assembly.hardware.profile if of_profile else assembly.sequence)
     entry, n_keys = (_plugin_of_profile if of_profile else _plugin_of_sequence)(assembly, loc)
     # a mapping of a plugin may hold keys of the core, such as `lines.channels`
@@ -163,7 +163,7 @@ def _plugin_of_profile(assembly: Assembly, loc: Loc) -> tuple[Entry | None, int]
 
 
 def _plugin_of_sequence(assembly: Assembly, loc: Loc) -> tuple[Entry | None, int]:
-    """The same of a setting of the sequence."""
+    """The plugin that a setting of the sequence belongs to, and how many keys lead to its settings."""
     registry, target = assembly.hardware.host.registry, assembly.sequence.target
     match loc:
         case ("planner", *_):

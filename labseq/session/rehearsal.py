@@ -1,4 +1,4 @@
-"""Plans for random loadings, as the rearrangements of a shot would ask for them."""
+"""Plans for random loadings, as in the rearrangements of a shot."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from labseq.roles import Step, loading_of
 from labseq.sequencer.lab import Lab
 
 SURVIVAL: Final = 0.98
-"""Share of the atoms that a cycle of a rehearsal leaves; 97.66 % of the target in the paper, after one."""
+"""Fraction of the atoms that survive a cycle of a rehearsal (in the paper 97.66 % of the target)."""
 
 
 class FirstCycle(NamedTuple):
-    """The first cycle of a rearrangement: its plan, what that does, and whether there were enough atoms."""
+    """The first cycle of a rearrangement, with plan, report, and whether there were enough atoms."""
 
     plan: Plan
     report: PlanReport
@@ -53,7 +53,7 @@ class Rehearsal:
 
 
 def quantile(values: NDArray[np.float64], share: float) -> float:
-    """Quantile of at least one value; those of numpy would import ``numpy.ma``, which takes 40 ms."""
+    """Quantile of at least one value, without numpy's, which imports ``numpy.ma`` in 40 ms."""
     ranks = np.arange(len(values))
     return float(np.interp(share * ranks[-1], ranks, np.sort(values)))
 
@@ -65,14 +65,14 @@ def windows_of(steps: Sequence[tuple[str, Step]]) -> dict[int, tuple[float, ...]
 
 
 def first_window_s(steps: Sequence[tuple[str, Step]]) -> float | None:
-    """Window of the first cycle of a shot, in seconds; None without a rearrangement."""
+    """Window of the first cycle of a shot, in seconds. None without a rearrangement."""
     return next((windows_s[0] for windows_s in windows_of(steps).values()), None)
 
 
 def rehearse(
     guard: Guard, lab: Lab, windows: Sequence[Sequence[float]], n_loadings: int, deadline: float
 ) -> tuple[list[Rehearsal], list[Plan], Problem | None]:
-    """Plan for random loadings; the seed of each is its number, as in `labseq plan random:... --seed N`.
+    """Plan for random loadings. The seed of each is its number, as in `labseq plan random:... --seed N`.
 
     Returns:
         The results of each rearrangement, some of the plans, and the planner's failure.
@@ -108,7 +108,7 @@ def rehearse(
 def _first_cycles(
     lab: Lab, windows: Sequence[Sequence[float]], loading: float, seed: int
 ) -> Iterator[FirstCycle]:
-    """The first cycle of each rearrangement, which begins where the one before ends."""
+    """The first cycle of each rearrangement, which begins where the previous rearrangement ends."""
     rng = np.random.default_rng(seed)
     occupancy = rng.random(lab.grid.shape) < loading
 

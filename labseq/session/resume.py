@@ -1,4 +1,4 @@
-"""`labseq resume`: a run that ended early is read back from its own folder and continued."""
+"""`labseq resume`, which reads back a run that ended early from its folder and continues it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _NEEDED: Final[Mapping[str, type]] = {
 
 @dataclass(slots=True)
 class ResumableRun:
-    """A run on disk that is being resumed; no other process can resume it until it is released.
+    """A run on disk that is being resumed. No other process can resume it until it is released.
 
     Attributes:
         run: The run as it was when it was opened for resuming.
@@ -63,7 +63,7 @@ class ResumableRun:
 
         Args:
             path: The run.
-            shots: Number of shots that it is to have; None for that which it was begun with.
+            shots: New number of shots of the run. None for its original number.
 
         Raises:
             ConfigError: It is complete, has as many shots, is in progress, or another process resumes it.
@@ -91,18 +91,16 @@ class ResumableRun:
             changes.append(
                 Change("the computer", owner.host, "this one; the run may still be in progress there")
             )
-        LineLog(folder / INDEX_FILE)  # ends an unfinished last line: if it is whole, its shot counts
+        LineLog(folder / INDEX_FILE)  # ends an unfinished last line, whose shot counts if it is complete
         run = open_run(folder)
         gone = [shot.index for shot in run.shots if not shot.file.is_file()]
         if shots is None and not gone and (over := is_over(run)):
             raise _refused(folder, f"{over}; --shots N adds more")
         done = frozenset(shot.index for shot in run.shots).difference(gone).union(run.skipped)
         if shots is not None and shots <= run.n_shots:
-            raise _refused(folder, f"it has {run.n_shots} shots; expected more than these with --shots")
+            raise _refused(folder, f"it has {run.n_shots} shots; expected a larger number with --shots")
         if gone:
-            warnings.append(
-                f"the files of these shots are gone, and the shots are taken again: {_numbers(gone)}"
-            )
+            warnings.append(f"these shots are taken again, because their files are gone: {_numbers(gone)}")
         return cls(run, done, tuple(changes), warnings, lock)
 
     @property
@@ -112,12 +110,12 @@ class ResumableRun:
 
     @property
     def root(self) -> Path:
-        """The data root of the run; of a run that was moved elsewhere, the folder that it is in."""
+        """The data root of the run. For a run that was moved elsewhere, the folder that it is in."""
         day = self.run.path.parent
         return day.parent if _DAY.fullmatch(day.name) else day
 
     def release(self) -> None:
-        """Let other processes resume the run; legal at any time."""
+        """Let other processes resume the run. Legal at any time."""
         self._lock.release()
 
     def assemble(self, *, realtime: bool) -> tuple[Assembly, Options]:
@@ -133,7 +131,7 @@ class ResumableRun:
         for path, own in files:
             if _has_changed(path, own.text):
                 self.warnings.append(
-                    f"{path} has been changed since; the run continues with its earlier content"
+                    f"{path} has been changed since, but the run continues with its earlier content"
                 )
         return assembly, options
 
@@ -141,7 +139,7 @@ class ResumableRun:
         """Compare the run as it began with the run as it would continue today.
 
         Raises:
-            ConfigError: A change is not accepted, or the remaining shots would be different ones.
+            ConfigError: A change is not accepted, or the remaining shots would be different.
         """
         record, folder = self.run.record, self.run.path
         today = record_today(self.run, assembly, options.changes())
@@ -161,7 +159,7 @@ class ResumableRun:
         Args:
             record: The current record of the run.
             code: The present code, which takes the remaining shots.
-            first_shot: The first shot that is taken; None if none is.
+            first_shot: The first shot that is taken. None if none is.
             stop: The request to stop the run.
 
         Raises:
@@ -184,9 +182,9 @@ class ResumableRun:
 
 
 def is_over(run: Run) -> str:
-    """Why there is nothing left to do in a run; "" if it can be resumed."""
-    # of a run that has failed after its last shot, resuming it would hide the reason; one whose process is
-    # gone, or that was stopped, has yet to be ended
+    """Why there is nothing left to do in a run, or "" if it can be resumed."""
+    # resuming a run that failed after its last shot would hide the reason, but a run that was stopped
+    # or whose process is gone must still be ended
     failed = read_state_file(run.path).get("state") == "failed"
     # a scanner, or `stop_when`, may end a run before all shots are taken
     is_scanner = SCANNER in (run.record.get("scan") or {})
@@ -194,7 +192,7 @@ def is_over(run: Run) -> str:
     if not ended and len({*run.skipped, *(shot.index for shot in run.shots)}) < run.n_shots:
         return ""
     if failed:
-        return f"no shot is missing, and its end stays on record: {run.error}"
+        return f"no shot is missing, and the reason of its end is kept: {run.error}"
     return f"it is complete: {run.ended_early or 'no shot is missing'}" if run.status == "complete" else ""
 
 
@@ -251,11 +249,11 @@ def reopened(
 
 
 def taken_again(path: Path, given: Options, *, same_seed: bool) -> tuple[Assembly, Options, list[str]]:
-    """Assemble a run's files for a new run, and say what differs from the earlier one.
+    """Assemble a run's files for a new run, and report differences from the earlier run.
 
     Args:
         path: The earlier run.
-        given: Options of the new run; all others are those of the earlier one.
+        given: Options of the new run. All others are taken from the earlier run.
         same_seed: Whether to take its seed, too.
 
     Raises:

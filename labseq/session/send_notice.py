@@ -1,4 +1,4 @@
-"""Sends one notice, read as JSON from stdin; its own process, started by :mod:`labseq.session.notices`."""
+"""Sends one notice, read as JSON from stdin, in a process started by :mod:`labseq.session.notices`."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ MAX_S: Final = 20.0
 
 
 def send(task: Mapping[str, Any]) -> list[str]:
-    """Send a notice by every way that is given.
+    """Send a notice to the program and the address, if they are set.
 
     Returns:
-        Why a way failed, for each one that did.
+        The failures, one text for each.
     """
     command, webhook, notice = task["command"], task["webhook"], task["notice"]
     ways: dict[str, Callable[[], object]] = {}
@@ -54,7 +54,7 @@ def _post(address: str, notice: Mapping[str, str]) -> None:
 
 
 def main() -> None:
-    """Send the notice, and add what failed to the log."""
+    """Send the notice, and add failures to the log."""
     task = json.load(sys.stdin)
     if failures := send(task):
         with Path(task["log"]).open("a", encoding="utf-8") as log:

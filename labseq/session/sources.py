@@ -1,4 +1,4 @@
-"""The code that makes a run's data: the plugins that are used, their sources, and their repositories."""
+"""The code that makes a run's data, with the used plugins, their sources, and their repositories."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from labseq.plugins.host import PluginHost
 from labseq.recording.folders import SOURCES_FILE
 
 LABSEQ_DIFF: Final = "labseq.diff"
-"""Name in the archive of what differs from the commit of labseq's own code."""
+"""Name in the archive of the differences between labseq's own code and its commit."""
 _SUFFIXES: Final = (".py", ".c", ".cpp", ".h", ".pyx")
 _GIT_TIMEOUT_S: Final = 5.0
 
 Sources = Mapping[str, bytes]
-"""The files of a plugin: path in its folder -> content."""
+"""The files of a plugin, path in its folder -> content."""
 
 
 class ReadSources(NamedTuple):
@@ -40,10 +40,10 @@ class RunCode:
     """The code of a run.
 
     Attributes:
-        plugins: What the run's record has of each plugin that is used: "name", "origin", "version", "path",
-            "sha256" of its sources, "git" as :meth:`Repository.plain` has it or None, and "used", what
-            is used of it.
-        git: The repositories of labseq's own code ("code") and of the sequence ("sequence"); likewise.
+        plugins: Entry of each used plugin in the run's record, with "name", "origin", "version", "path",
+            "sha256" of its sources, "git" from :meth:`Repository.plain` or None, and "used", the kinds and
+            names that are used of it.
+        git: The repositories of labseq's own code ("code") and of the sequence ("sequence"), likewise.
         archive: The sources of the plugins, as a zip file.
     """
 
@@ -52,7 +52,7 @@ class RunCode:
     archive: bytes
 
     def is_of(self, host: PluginHost) -> bool:
-        """Whether nothing more is used now."""
+        """Whether exactly the same parts of the same plugins are used now."""
         return [[*plugin.offers] for plugin in host.used()] == [plugin["used"] for plugin in self.plugins]
 
 
@@ -61,8 +61,8 @@ class Repository(NamedTuple):
 
     Attributes:
         commit: Its commit.
-        dirty: Whether any tracked file differs from that.
-        diff: How its tracked Python files differ.
+        dirty: Whether any tracked file differs from the commit.
+        diff: The differences of its tracked Python files.
     """
 
     commit: str
@@ -70,7 +70,7 @@ class Repository(NamedTuple):
     diff: str
 
     def plain(self) -> dict[str, Any]:
-        """The state as a run's record has it, with the digest of the differences, "" if there are none."""
+        """The state for a run's record, with the digest of the differences, "" if there are none."""
         digest = hashlib.sha256(self.diff.encode()).hexdigest() if self.diff else ""
         return {"commit": self.commit, "dirty": self.dirty, "code_sha256": digest}
 
@@ -79,11 +79,11 @@ def gather_code(host: PluginHost, sequence_folder: Path, also: Collection[str] =
     """Read the sources of all plugins that a run uses, and the states of their repositories.
 
     Args:
-        also: Names of others that are wanted.
+        also: Names of further plugins to include.
     """
     own, sequence_root, plugins = Path(labseq.__file__).parent, _root_of(sequence_folder), host.used(also)
     homes = {plugin.name: own if plugin.is_built_in else plugin.home for plugin in plugins}
-    with ThreadPoolExecutor(1) as thread:  # git takes longer than all else here
+    with ThreadPoolExecutor(1) as thread:  # git takes longer than everything else here
         paths = [path for path in {own, sequence_root, *homes.values()} if path is not None]
         states = thread.submit(repositories, paths)
         sources = {
@@ -98,7 +98,7 @@ def gather_code(host: PluginHost, sequence_folder: Path, also: Collection[str] =
     archived = {
         f"{plugin.name}/{name}": data
         for plugin in plugins
-        if not plugin.is_built_in  # it is 1 MB more for each run, and in the commit or the release
+        if not plugin.is_built_in  # 1 MB more for each run, although it is in the commit or the release
         for name, data in sources[plugin.name].files.items()
     }
     if own in repository_of and repository_of[own].diff:
@@ -121,7 +121,7 @@ def gather_code(host: PluginHost, sequence_folder: Path, also: Collection[str] =
 
 
 def read_sources(home: Path | None) -> Sources:
-    """The sources of a plugin: its file, or those in the folder of its package; none of an unknown place."""
+    """The sources of a plugin, its file or the files in its package's folder. Empty for an unknown place."""
     if home is None:
         return {}
     files = [home]
@@ -146,11 +146,11 @@ def _read(home: Path | None) -> ReadSources:
 
 
 _read_once = functools.cache(_read)
-"""The same of an installed package, which Python imports once: what is edited later is not what runs."""
+"""The same for an installed package, which Python imports only once, so that later edits do not run."""
 
 
 def digest_of(sources: Sources) -> str:
-    """SHA-256 of a single file as it is; of several, of what `sha256sum` prints of them; "" of none."""
+    """SHA-256 of a single file, or of the output of `sha256sum` for several files, or "" for none."""
     digests = {name: hashlib.sha256(data).hexdigest() for name, data in sources.items()}
     if len(digests) <= 1:
         return next(iter(digests.values()), "")
@@ -161,7 +161,7 @@ def digest_of(sources: Sources) -> str:
 
 @functools.lru_cache(maxsize=2)
 def _zipped(files: tuple[tuple[str, bytes], ...]) -> bytes:
-    """A zip file of names and contents; the same for the same files."""
+    """A zip file of names and contents, identical for identical files."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, data in files:
@@ -170,7 +170,7 @@ def _zipped(files: tuple[tuple[str, bytes], ...]) -> bytes:
 
 
 def archived_sources(run_dir: Path, plugin: str) -> Sources:
-    """The sources of a plugin that a run keeps; none if it has no such archive, or that is damaged."""
+    """The sources of a plugin that a run keeps. Empty if it has no such archive, or that is damaged."""
     with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(run_dir / SOURCES_FILE) as archive:
         prefix = f"{plugin}/"
         names = [name for name in archive.namelist() if name.startswith(prefix)]
@@ -179,9 +179,9 @@ def archived_sources(run_dir: Path, plugin: str) -> Sources:
 
 
 def repositories(paths: Collection[Path]) -> dict[Path, Repository]:
-    """The repository that each path belongs to; none for a path outside, or without git.
+    """The repository that each path belongs to, without paths outside of a repository, or without git.
 
-    A package that is installed in an environment inside of a repository is not part of that repository.
+    A package that is installed in an environment inside a repository is not part of that repository.
     """
     roots = {path: root for path in paths if (root := _root_of(path)) is not None}
     different = {*roots.values()}

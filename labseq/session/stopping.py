@@ -1,4 +1,4 @@
-"""Asks a run in another process to end after its current shot: `labseq stop`."""
+"""Asks a run in another process to end after its current shot, for `labseq stop`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def ask_to_stop(run_dir: Path) -> None:
 
 
 def is_running(run_dir: Path) -> bool:
-    """Whether a run is in progress; for a run on another computer, as its folder says."""
+    """Whether a run is in progress. For a run on another computer, its folder says so."""
     return read_state(run_dir)[0] == "running"
 
 
@@ -33,7 +33,7 @@ def running_here(profile: str | None = None) -> list[Path]:
     """The folders of the runs in progress on this computer.
 
     Args:
-        profile: Name or path of a profile; only runs on it are returned.
+        profile: Name or path of a profile, to return only runs on it.
 
     Raises:
         ConfigError: There is no such profile.
@@ -56,7 +56,7 @@ def find_running(run: Path | None = None, profile: str | None = None) -> Path:
         Its folder.
 
     Raises:
-        ConfigError: The run is not in progress; or no run is in progress, or several are.
+        ConfigError: The run is not in progress, no run is in progress, or several are.
         RecordingError: There is no such run.
     """
     if run is not None:

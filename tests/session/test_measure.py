@@ -286,7 +286,7 @@ def test_a_resumed_run_ends_at_the_same_shot(tmp_path: Path) -> None:
     [
         ("linear", "slope", ""),
         ("broken", "life", "raised TypeError"),
-        ("stuck", "life", "the fit stuck has not ended after"),
+        ("stuck", "life", "the fit stuck did not end within"),
     ],
 )
 def test_points_that_do_not_follow_or_a_broken_model_do_not_end_it(
