@@ -1,6 +1,6 @@
 """The error tree of labseq.
 
-Every error that labseq raises on purpose is a :class:`LabseqError`. Its attributes hold the values, its
+Every error that labseq raises on purpose is a :class:`LabseqError`. Its attributes hold the values. Its
 message says what is wrong, what was expected and what to do. ``exit_code`` is the exit code of the command
 line.
 """
@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, ClassVar, Literal, TypeAlias
 
 Loc: TypeAlias = tuple[str | int, ...]
-"""Location of a value in a document: keys and list indices from the top, ("shot", 2, "rearrange")."""
+"""Location of a value in a document, as keys and list indices from the top, ("shot", 2, "rearrange")."""
 
 
 class LabseqError(Exception):
@@ -397,7 +397,7 @@ class AlarmError(LabseqError):
         self.alarm = alarm
         self.text = text
         self.n_shots = n_shots
-        hint = "its limit is 'alarms' in the profile"
+        hint = "see 'alarms' in the profile for its limit"
         shots = "1 shot" if n_shots == 1 else f"{n_shots} shots in a row"
         super().__init__(f"alarm '{alarm}' in {shots} ({hint}): {text}")
 
@@ -426,9 +426,9 @@ def one_of(names: Sequence[str]) -> str:
         >>> one_of(["psca", "lsap"])
         "one of 'psca', 'lsap'"
         >>> one_of([])
-        'nothing: none is installed'
+        'nothing, because none is installed'
     """
     if not names:
-        return "nothing: none is installed"
+        return "nothing, because none is installed"
     quoted = ", ".join(f"'{name}'" for name in names)
     return quoted if len(names) == 1 else f"one of {quoted}"

@@ -144,8 +144,8 @@ _ADVICE: Final = {
     errno.ENOSPC: f"the disk is full; free some space, or {_ELSEWHERE}",
     errno.EDQUOT: f"your disk quota is used up; free some space, or {_ELSEWHERE}",
     errno.EROFS: f"the disk is read-only; {_ELSEWHERE}",
-    errno.ENOTDIR: f"a file has the name of a folder; move it, or {_ELSEWHERE}",
-    errno.EEXIST: f"a file has the name of a folder; move it, or {_ELSEWHERE}",
+    errno.ENOTDIR: f"a file is where a folder is needed; move it, or {_ELSEWHERE}",
+    errno.EEXIST: f"a file is where a folder is needed; move it, or {_ELSEWHERE}",
     errno.ENOENT: "the folder is gone; do not move or delete a run while it is written",
     errno.EIO: f"the disk reports a fault; check it and its cable, or {_ELSEWHERE}",
 }

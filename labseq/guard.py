@@ -32,8 +32,7 @@ POLL_S: Final = 0.05
 GRACE_S: Final = 1.0
 """How long a call may take to return after a stop request."""
 SHOT_GRACE_S: Final = 2.0
-"""The same for the steps of a shot. It is longer, because a step's own call into a device has its grace
-first."""
+"""Grace time of the steps of a shot, longer than the grace time of a device call within a step."""
 DRIVER_MARGIN_S: Final = 2.0
 """A call counts as hung this long after the timeout that the driver itself was given."""
 
@@ -389,7 +388,7 @@ class Guard:
         """Run a call in the owner's thread and wait for its end.
 
         Args:
-            owner: Whose thread it runs in.
+            owner: Device or plugin whose thread runs the call.
             timeout_s: How long it may take.
             work: The call.
             grace_s: How long it may take to return after a stop request.

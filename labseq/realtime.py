@@ -36,7 +36,7 @@ def raise_priority(above: int = 0) -> bool:
 
 
 def restore_priority() -> None:
-    """Make this thread an ordinary one again."""
+    """Give this thread normal priority again."""
     _set_scheduler("SCHED_OTHER", 0)
 
 

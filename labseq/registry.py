@@ -51,7 +51,7 @@ class Owner:
         return PluginLoadError(self.name, reason, self.source)
 
     def note(self, sentence: str) -> None:
-        """Keep a sentence about it, once."""
+        """Add a note about the plugin, unless it is there already."""
         if sentence not in self.notes:
             self.notes.append(sentence)
 
@@ -101,7 +101,7 @@ class Entry:
 
     @property
     def is_place(self) -> bool:
-        """Whether its plugin gave places, and nothing was imported yet."""
+        """Whether parts of it are still given as places and not imported yet."""
         return any(isinstance(part, str) and ":" in part for part in (self.factory, self.settings_model))
 
 
@@ -182,7 +182,7 @@ class Registry:
         self._entries[kind, name] = entry
 
     def forget(self, origin: str) -> None:
-        """Remove all that a plugin offers."""
+        """Remove all entries of a plugin."""
         for key in self.offers(origin):
             del self._entries[key]
 

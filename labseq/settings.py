@@ -319,7 +319,7 @@ def _beside_its_file(path: Path, info: ValidationInfo) -> Path:
 
 
 Text: TypeAlias = Annotated[str, Field(min_length=1)]
-"""Any text except the empty one."""
+"""Text that is not empty."""
 FilePath: TypeAlias = Annotated[Path, AfterValidator(_beside_its_file)]
 """A file, relative to the sequence or profile that names it, or in Python to the working folder."""
 Duration: TypeAlias = Annotated[float, _quantity("time"), Field(ge=0), AfterValidator(_not_too_long)]
@@ -371,7 +371,7 @@ class Choice(Settings):
         return frozenset(setting.key for setting in settings_of(type(self)))
 
     def placed(self, *loc: str | int) -> Self:
-        """A copy that knows where its mapping is."""
+        """A copy with the location of its mapping."""
         copy = self.model_copy()
         copy._loc = loc  # noqa: SLF001 - of the same class
         return copy

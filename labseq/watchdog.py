@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from labseq.watchdog_process import Hanging
 
 WATCHDOG_LOG: Final = "watchdog.jsonl"
-"""Name of its log in the folder of a run."""
+"""Name of the watchdog's log in the folder of a run."""
 BEAT_S: Final = 0.05
 """Interval between two heartbeats."""
 STUCK_S: Final = 10.0

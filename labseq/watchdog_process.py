@@ -38,7 +38,7 @@ longer."""
 HANGS_S: Final = 1.0
 """Further time after which switching off counts as hanging."""
 MAX_TEXT: Final = 500
-"""Length at which texts of errors are cut."""
+"""Maximum length of the text of an error, in characters."""
 
 
 def main() -> None:

@@ -274,7 +274,9 @@ def test_an_alarm_ends_its_run_and_not_the_campaign(
     assert (dark.status, len(dark.shots)) == (status, repeats)
     assert "alarm 'atoms'" in str([dark.error, dark.record["resumed"]])
     if status == "failed":
-        with pytest.raises(ConfigError, match=r"no shot is missing, and the reason of its end is kept: .*'atoms'"):
+        with pytest.raises(
+            ConfigError, match=r"no shot is missing, and the reason of its end is kept: .*'atoms'"
+        ):
             Session.resume(dark.path)
 
 

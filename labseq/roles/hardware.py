@@ -534,6 +534,6 @@ def unknown_name(device: str, kind: str, name: str, names: Sequence[str]) -> Dev
         >>> str(unknown_name("shutter", "command", "opne", ["open", "close"]))
         "shutter: unknown command 'opne'; expected one of 'open', 'close'; did you mean 'open'?"
     """
-    message = f"unknown {kind} '{clean(name)}'; expected {one_of(names) if names else 'none, as it has none'}"
+    message = f"unknown {kind} '{clean(name)}'; expected {one_of(names) if names else 'nothing, it has none'}"
     hint = did_you_mean(name, names)
     return DeviceError(device, f"{message}; {hint}" if hint else message)

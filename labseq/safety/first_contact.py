@@ -153,7 +153,7 @@ def _names(hardware: ResolvedProfile, role: str) -> list[str]:
     names = [name for name, choice in devices.items() if role in ("", name) and not choice.entry.virtual_time]
     if not names:
         what = f"{role or 'every device of the profile'} is virtual, so there is no device to meet"
-        hint = "choose a driver, with the device or its simulator, with 'use:' in the profile"
+        hint = "choose a driver for the device or its simulator with 'use:' in the profile"
         raise ConfigError(Problem(what, str(hardware.document.path), hint=hint))
     return names
 
@@ -171,7 +171,7 @@ def _check_writable(folder: Path) -> None:
 
 
 def _identity_only(name: str, device: Hardware, checked: CheckedDevice, data: Path) -> Contact:
-    """The contact with a device whose driver offers no steps.
+    """Identity, settings and limits of a device whose driver offers no steps.
 
     Raises:
         LabseqError: It cannot be opened, identified, made safe or closed.

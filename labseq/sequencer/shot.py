@@ -468,7 +468,9 @@ class RunningShot:
         """
         by, achieved_s = self.step_context.release_by, duration_s
         if by is None:
-            raise ConfigError("neither a line of this profile nor their driver turns the static tweezers off")
+            raise ConfigError(
+                "neither a line nor the driver can turn the static tweezers of this profile off"
+            )
         with self.lines_on("release", duration_s):
             if by.name == "static_tweezers":
                 limit_s = duration_s + self.call_timeout_s
@@ -626,7 +628,7 @@ class RunningShot:
         shape = self.grid.shape
         if not (isinstance(answer, tuple) and len(cast("tuple[Any, ...]", answer)) in (2, 3)):
             raise DeviceError(
-                "detector", f"detect() returned {type(answer).__name__}; expected a tuple of 2 or 3"
+                "detector", f"detect() returned {type(answer).__name__}; expected 2 or 3 arrays"
             )
         parts = cast("tuple[Any, ...]", answer)
         for name, array, kind in zip(("occupancy", "confidence", "signals"), parts, "bff", strict=False):

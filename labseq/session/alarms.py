@@ -31,7 +31,7 @@ LEAST_CONFIDENCES: Final = 1000
 
 
 class Latest:
-    """A share of sites or atoms, over as few of the latest shots as have enough of them together.
+    """A fraction of sites or atoms, over as few recent shots as together have enough of them.
 
     Args:
         least: The number that is enough.
@@ -158,7 +158,7 @@ class Alarms:
             yield "confidence", f"{what}; check its thresholds and width against gain and exposure"
 
     def _moves(self, shot: ShotRecord) -> Iterator[tuple[str, str]]:
-        """Whether the atoms that the first cycle moved are seen where it moved them."""
+        """Whether atoms are seen at the sites to which the first cycle moved them."""
         for before, after in pairwise(shot.images) if shot.cycles else ():
             cycle = shot.cycles[0]
             if (after.step, after.cycle) != (cycle.step, cycle.cycle):

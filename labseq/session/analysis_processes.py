@@ -167,7 +167,7 @@ class AnalysisProcesses(Analyses):
             n_missing, n_failed = len(shots - shots_with_result(rows)), sum(ERROR in row for row in rows)
             if n_missing:
                 failed = f" ({n_failed} failed)" if n_failed else ""
-                text = f"analysis '{name}' has no result of {n_missing} of {len(shots)} shots{failed}"
+                text = f"analysis '{name}' has no result for {n_missing} of {len(shots)} shots{failed}"
                 self._warn(f"{text}; 'labseq analyse {self._run_dir}' computes the missing results")
 
     def _value(self, name: str, shot: int, row: Mapping[str, Any] | None) -> float | None:
@@ -183,7 +183,7 @@ class AnalysisProcesses(Analyses):
             why = f"the analysis failed: {row[ERROR]}"
         else:
             others = [f"{prefix}{other}" for other in row if other != SHOT]
-            why = did_you_mean(name, others) or f"as a number; the analysis gave {listing(others)}"
+            why = did_you_mean(name, others) or f"it is not a number; the analysis gave {listing(others)}"
         if (kind := (name, why.partition(":")[0])) not in self._warned:
             self._warned.add(kind)
             self._warn(f"shot {shot} has no '{clean(name)}': {why}")

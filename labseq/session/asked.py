@@ -93,7 +93,7 @@ class BackgroundRun:
         self._thread.start()
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Note that the devices are open, and whether a shot goes on."""
+        """Note that the devices are open, and whether a shot is in progress."""
         if name == "run_started":
             self.run_dir = Path(values["run_dir"])
             self.started.set()
@@ -187,7 +187,7 @@ class AskedShots(BackgroundRun):
             self._results.put(ShotResult.of(values["shot"], values["row"], self.run_dir))
 
     def ended(self) -> None:
-        """Let the thread that waits for a shot go on."""
+        """Let the thread that waits for a shot continue."""
         self._results.put(None)
 
     def _point(self, values: Mapping[str, Any]) -> Point:

@@ -487,7 +487,7 @@ def _rehearse_all(checks: _Checks, points: Iterable[_PointCheck], runs: bool) ->
 
 
 def _plan_options(assembly: Assembly, point: Point) -> str:
-    """The options by which `labseq plan` plans as a run does at a point."""
+    """Options with which `labseq plan` plans as a run does at a point."""
     settings = changed_settings(point.planner.settings)
     options = ["--target", str(assembly.document.path), "--planner", point.planner.entry.name]
     options += ["--profile", str(assembly.hardware.document.path)]

@@ -149,12 +149,12 @@ class ResumableRun:
         self.changes += tuple(changes_between(self.run, today))
         if self.changes and not accept:
             problems = [Problem(str(change), str(folder)) for change in self.changes]
-            what = "this has changed since the run was begun"
+            what = "the run was begun before these changes"
             hint = "'labseq resume --accept-changes' continues anyway, and records the changes"
             raise ConfigError([*problems, Problem(what, str(folder), hint=hint)])
 
     def reopen(self, record: RunRecord, code: RunCode, first_shot: int | None, stop: StopFlag) -> RunWriter:
-        """Open its folder for writing, and keep the sources of the plugins if changed ones take shots.
+        """Open its folder for writing, and keep the plugins' sources if they have changed and take shots.
 
         Args:
             record: The current record of the run.
@@ -229,7 +229,7 @@ def _numbers(shots: list[int]) -> str:
 def reopened(
     path: Path, shots: int | None, *, accept_changes: bool, realtime: bool
 ) -> tuple[Assembly, Options, ResumableRun]:
-    """Read a run back so that it can be continued, with ``shots`` up to that number of shots.
+    """Read a run back so that it can be continued, up to ``shots`` shots if given.
 
     Raises:
         ConfigError: The run cannot be resumed, or something has changed.

@@ -60,7 +60,7 @@ def only_new_garbage() -> Generator[None]:
 
 
 class Shots:
-    """Takes the shots of a run, each at its point. Others choose the points.
+    """Takes the shots of a run, each at its point, which ``run.points`` chooses.
 
     Args:
         run: The run.

@@ -175,7 +175,11 @@ def test_a_second_wait_does_not_load_again(tmp_path: Path) -> None:
         ),
         ([], "fast", "a full dry run simulates it and sends `go`, a fast dry run leaves it out"),
         (["shot.0.wait.device=shutter"], "off", "'shutter' cannot receive signals of another control system"),
-        (["shot.0.wait.device=artiq"], "off", "'artiq' cannot receive signals of another control system; expected 'leader'"),
+        (
+            ["shot.0.wait.device=artiq"],
+            "off",
+            "'artiq' cannot receive signals of another control system; expected 'leader'",
+        ),
     ],
 )
 def test_who_cannot_lead_is_reported_before_anything_is_opened(

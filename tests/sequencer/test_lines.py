@@ -192,7 +192,7 @@ def test_a_blinding_line_refuses_an_exposure_with_em_gain() -> None:
 
     camera = Multiplying()
     made = with_camera(Rig((LOAD, IMAGE), line_specs=[blinding]), camera)
-    with pytest.raises(DeviceError, match="while 'mot' is on, .* remove `image` from the `on`"):
+    with pytest.raises(DeviceError, match=r"while 'mot' is on, .* remove `image` from the `on`"):
         made.run()
     assert "camera.arm" not in made.lab.calls.names()
 

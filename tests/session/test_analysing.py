@@ -120,9 +120,9 @@ def test_analyses_that_fail_leave_the_run_alone(tmp_path, monkeypatch):
     assert (done.status, len(done.shots)) == ("complete", 3)
     text = "\n".join(warnings(done))
     assert re.search(r"analysis 'fails' failed: shot 1: ValueError: too dark \(.*\.py:\d+\); see ", text)
-    assert "analysis 'fails' has no result of 1 of 3 shots (1 failed); 'labseq analyse" in text
+    assert "analysis 'fails' has no result for 1 of 3 shots (1 failed); 'labseq analyse" in text
     assert "analysis 'dies' failed: its process ended with exit code 7; see " in text
-    assert "analysis 'dies' has no result of 3 of 3 shots; " in text
+    assert "analysis 'dies' has no result for 3 of 3 shots; " in text
     assert "analysis 'nomapping' failed: shot 0: TypeError: the result is int; expected a mapping" in text
     assert len(warnings(done)) == 6
     assert done.analysis("fails")[1]["error"].startswith("ValueError: too dark (")
@@ -149,7 +149,7 @@ def test_an_analysis_that_does_not_finish_is_ended(tmp_path, monkeypatch):
     assert done.status == "complete"
     ended, left = warnings(done)
     assert "'hangs' did not finish within 0 s" in ended
-    assert "'hangs' has no result of 3 of 3 shots" in left
+    assert "'hangs' has no result for 3 of 3 shots" in left
     assert f"'labseq analyse {done.path}'" in left
 
 
