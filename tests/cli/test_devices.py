@@ -230,7 +230,7 @@ def test_standing_by_needs_devices_that_are_locked_and_ends_no_process_that_work
     write("virtual")
     code, _, error = call("safe", "./p.yaml", "--stand-by")
     assert code == 2
-    assert error.startswith("error: p.yaml: all of its devices are simulated")
+    assert error.startswith("error: p.yaml: all its devices are simulated")
     code, _, error = call("safe", "./p.yaml", "--stand-by", "--end")
     assert code == 2
     assert "leave out --end" in error

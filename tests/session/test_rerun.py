@@ -32,7 +32,7 @@ def test_a_complete_run_gets_more_shots(tmp_path: Path) -> None:
     options: dict[str, Any] = {"seed": 4, "output": tmp_path}
     whole = labseq.Session.open(sequence, shots=8, **options).run()
     run = labseq.Session.open(sequence, shots=5, **options).run()
-    with pytest.raises(ConfigError, match="it has 5 shots; expected more"):
+    with pytest.raises(ConfigError, match="it has 5 shots; expected a larger number"):
         labseq.Session.resume(run.path, shots=5)
     with labseq.Session.resume(run.path, shots=8) as session:
         more = session.run()
