@@ -200,7 +200,7 @@ def connect(address: str, keys: Path | None) -> Any:
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are reported once, by labseq
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # other versions of packages that labseq does not use there
+            warnings.simplefilter("ignore")  # about versions of packages that labseq does not use there
             # results come from the workers, by way of the scheduler only where that is not possible
             return Client(
                 address,

@@ -75,7 +75,7 @@ class Settings(BaseModel):
     )
 
     def identities(self) -> Sequence[str] | None:
-        """For drivers, names of what only one process can use, such as a port, a card or a serial number.
+        """For drivers, names of resources that only one process can use, such as a port or a card.
 
         labseq locks them before opening, and recognises them after a crash, even with another profile. Empty
         if there is nothing to lock. If it is None (default), the profile's path is used instead.
@@ -323,27 +323,27 @@ Text: TypeAlias = Annotated[str, Field(min_length=1)]
 FilePath: TypeAlias = Annotated[Path, AfterValidator(_beside_its_file)]
 """A file, relative to the sequence or profile that names it, or in Python to the working folder."""
 Duration: TypeAlias = Annotated[float, _quantity("time"), Field(ge=0), AfterValidator(_not_too_long)]
-"""Seconds, from 0 to :data:`MAX_DURATION_S`, as "45 ms"."""
+"""Seconds, from 0 to :data:`MAX_DURATION_S`, for example "45 ms"."""
 PositiveDuration: TypeAlias = Annotated[
     float, _quantity("time"), Field(gt=0), AfterValidator(_not_too_long)
 ]  # not built on Duration, whose limit would be named for values below 0
-"""Seconds, more than 0, at most :data:`MAX_DURATION_S`, as "45 ms"."""
+"""Seconds, more than 0, at most :data:`MAX_DURATION_S`, for example "45 ms"."""
 Length: TypeAlias = Annotated[float, _quantity("length")]
-"""Metres, as "4.49 um"."""
+"""Metres, for example "4.49 um"."""
 Frequency: TypeAlias = Annotated[float, _quantity("frequency")]
-"""Hertz, as "80 MHz"."""
+"""Hertz, for example "80 MHz"."""
 Speed: TypeAlias = Annotated[float, _quantity("speed"), Field(gt=0)]
-"""Metres per second, more than 0, as "130 um/ms"."""
+"""Metres per second, more than 0, for example "130 um/ms"."""
 Voltage: TypeAlias = Annotated[float, _quantity("voltage")]
-"""Volts, as "200 mV"."""
+"""Volts, for example "200 mV"."""
 Power: TypeAlias = Annotated[float, _quantity("power")]
-"""Watts, as "10 mW"."""
+"""Watts, for example "10 mW"."""
 Temperature: TypeAlias = Annotated[float, _quantity("temperature")]
-"""Kelvins, as "300 uK"."""
+"""Kelvins, for example "300 uK"."""
 Angle: TypeAlias = Annotated[float, _quantity("angle")]
-"""Radians, as "60 deg"."""
+"""Radians, for example "60 deg"."""
 Fraction: TypeAlias = Annotated[float, _quantity("fraction"), Field(ge=0, le=1)]
-"""0 to 1, as "75 %"."""
+"""0 to 1, for example "75 %"."""
 
 
 class Choice(Settings):

@@ -28,8 +28,7 @@ WATCHDOG_LOG: Final = "watchdog.jsonl"
 BEAT_S: Final = 0.05
 """Interval between two heartbeats."""
 STUCK_S: Final = 10.0
-"""A run counts as dead if the thread that takes its shots has neither waited nor made progress for this
-long."""
+"""A run counts as dead if its shot thread has neither waited nor made progress for this long."""
 ANSWER_S: Final = 10.0
 """How long a run waits for an answer from the watchdog, which may have to load a vendor's library."""
 END_S: Final = 1.0
@@ -230,7 +229,7 @@ class Watchdog:
     def _beat(self) -> None:
         """Send heartbeats, report a run without progress, and replace a watchdog that is gone.
 
-        If this thread does not run either, the whole computer stops, so little of that time counts.
+        If this thread does not run either, the whole computer has paused, so little of that time counts.
         """
         n_failed, looked_s = 0, time.monotonic()
         while not self._ended.is_set():

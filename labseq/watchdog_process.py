@@ -33,8 +33,7 @@ TERM_S: Final = 0.1
 NEXT_S: Final = 0.05
 """How long switching off one device may delay the next."""
 TRY_AGAIN_S: Final = 5.0
-"""How long switching off is retried if it fails, since a dying process may hold the device a little
-longer."""
+"""How long switching off is retried if it fails, as a dying process may still hold the device."""
 HANGS_S: Final = 1.0
 """Further time after which switching off counts as hanging."""
 MAX_TEXT: Final = 500
@@ -52,7 +51,7 @@ def main() -> None:
 
 
 def _take_precedence() -> None:
-    """Get real-time priority, locked memory and the last place when memory runs out, where allowed."""
+    """Ask for real-time priority, locked memory, and to be killed last when memory runs out."""
     with suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     with suppress(OSError):

@@ -48,7 +48,7 @@ def line_program(
         for spec in specs
     ]
     times = _apart([0.0, *(t for of_line in spans for span in of_line for t in span), over_s])
-    states = [[False] * len(specs) for _ in times]  # arrays this small take longer, and atoms may wait
+    states = [[False] * len(specs) for _ in times]  # small arrays take longer than lists, and atoms may wait
     for column, (spec, of_line) in enumerate(zip(specs, spans, strict=True)):
         is_idle = IDLE in spec.on and not spec.pulse_s
         if is_idle and kind in spec.on:  # on before, in and after it

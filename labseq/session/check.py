@@ -368,7 +368,7 @@ def check(run: PreparedRun, *, runs: bool = False) -> CheckReport:
         numbers: dict[_PointCheck, set[int]] = {first: {0}}
         for number, point in run.points.known(run.history).items():
             numbers.setdefault(checks.of(point), set()).add(number)
-        # the first points first, in whatever order the shots take them
+        # in the order of the points, not of the shots
         numbers = dict(sorted(numbers.items(), key=lambda item: min(item[1])))
         asks = (
             _PointCheck.ask_settings,

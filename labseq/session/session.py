@@ -519,7 +519,7 @@ class Session(PreparedRun):
     def _begin(self, first: Point | None, reading: Future[RunCode]) -> tuple[RunRecord, RunWriter]:
         """Create the run's folder, or reopen a resumed run's folder. ``first`` is its next point, if any."""
         changes, earlier, code = self.options.changes(), self.earlier, reading.result()
-        if not code.is_of(self.assembly.hardware.host):  # a planner that was constructed uses another's
+        if not code.is_of(self.assembly.hardware.host):  # a constructed planner may use another plugin
             code = code_of(self.assembly, self._cwd)
         record = run_record(self.assembly, self.seed, changes, self._cwd, code)
         if earlier is None:
