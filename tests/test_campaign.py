@@ -275,7 +275,7 @@ def test_an_alarm_ends_its_run_and_not_the_campaign(
     assert "alarm 'atoms'" in str([dark.error, dark.record["resumed"]])
     if status == "failed":
         with pytest.raises(
-            ConfigError, match=r"no shot is missing, and the reason of its end is kept: .*'atoms'"
+            ConfigError, match=r"no shot is missing, and its failure stays on record: .*'atoms'"
         ):
             Session.resume(dark.path)
 

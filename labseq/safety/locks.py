@@ -51,7 +51,7 @@ def lock_devices(
                     make_shared(lock.path.parent)
                     holder = lock.take()
                 except OSError as error:
-                    # a folder without locks must not prevent work, and not `labseq safe` either
+                    # a folder without locks must prevent neither work nor `labseq safe`
                     text = f"{lock.path} cannot be locked: {error.strerror or error}"
                     warn(f"{text}; another process could use {device} at the same time")
                     break

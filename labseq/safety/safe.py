@@ -256,7 +256,7 @@ def stand_by(
 ) -> None:
     """Until Ctrl-C, make devices safe when a process that uses them hangs, or dies and leaves them on.
 
-    The locks of the devices tell the process. Devices that other processes use are left alone.
+    The locks of the devices name that process. Devices that other processes use are left alone.
 
     Args:
         announce: Receives the devices at the beginning, then each process that died or hangs.

@@ -468,9 +468,7 @@ class RunningShot:
         """
         by, achieved_s = self.step_context.release_by, duration_s
         if by is None:
-            raise ConfigError(
-                "neither a line nor the driver can turn the static tweezers of this profile off"
-            )
+            raise ConfigError("neither a line nor the driver can turn off this profile's static tweezers")
         with self.lines_on("release", duration_s):
             if by.name == "static_tweezers":
                 limit_s = duration_s + self.call_timeout_s

@@ -1,4 +1,4 @@
-"""Alarms, which notice in every shot if the machine does not see or move atoms, without a check for it.
+"""Alarms for shots in which the machine does not see or move atoms. They need no check in the sequence.
 
 A camera that sees nothing, a laser that is off or a stage that does not move give shots that look complete.
 Each alarm warns when it begins. After some shots in a row it ends the run, so that a night is not lost.
@@ -25,7 +25,7 @@ from labseq.units import format_quantity
 LEAST_COMPARED: Final = 10
 """Minimum number of loadings to compare with, because the mean of fewer is too uncertain."""
 LEAST_ATOMS: Final = 100
-"""Minimum number of sites, or of moved atoms, to judge a share by, because few give one by chance."""
+"""Minimum number of sites, or of moved atoms, to judge a fraction by, as fewer may alarm by chance."""
 LEAST_CONFIDENCES: Final = 1000
 """The same for the confidence, which depends on a few doubtful sites."""
 

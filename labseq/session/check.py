@@ -239,7 +239,7 @@ class _PointCheck:
 
 
 def _badly_timed(point_check: _PointCheck) -> Iterator[tuple[int, Problem, bool]]:
-    """Index, problem and refusal of steps of fixed length that the computer keeps roughly or not."""
+    """Index, problem and refusal of each step whose fixed length the computer cannot keep exactly."""
     timelines = [bars for _, bars in point_check.timeline]
     least = format_quantity(COMPUTER.accuracy_s, "time")
     for number, bars in enumerate(timelines):
@@ -307,7 +307,7 @@ class CheckReport:
     """Timeline, duration, disk space and warnings of a run, before it starts.
 
     Attributes:
-        timeline: Name and bars of each step. In a scan, this and all but ``run_s`` are for the first point.
+        timeline: Name and bars of each step. In a scan, all but ``run_s`` refer to the first point.
         n_shots: Shots of the run.
         n_points: Number of scan points that these shots visit. None without a scan.
         run_s: Minimum and maximum duration of the run, in seconds.

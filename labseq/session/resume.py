@@ -192,7 +192,7 @@ def is_over(run: Run) -> str:
     if not ended and len({*run.skipped, *(shot.index for shot in run.shots)}) < run.n_shots:
         return ""
     if failed:
-        return f"no shot is missing, and the reason of its end is kept: {run.error}"
+        return f"no shot is missing, and its failure stays on record: {run.error}"
     return f"it is complete: {run.ended_early or 'no shot is missing'}" if run.status == "complete" else ""
 
 
