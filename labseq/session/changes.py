@@ -34,7 +34,7 @@ class Change(NamedTuple):
     now: str
 
     def __str__(self) -> str:
-        return f"{self.what} was {self.was}, is {self.now}"
+        return f"{self.what} was {self.was} and is now {self.now}"
 
 
 def record_today(run: Run, assembly: Assembly, changes: Mapping[str, str]) -> RunRecord:

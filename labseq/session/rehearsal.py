@@ -18,8 +18,7 @@ from labseq.roles import Step, loading_of
 from labseq.sequencer.lab import Lab
 
 SURVIVAL: Final = 0.98
-"""Fraction of the atoms that survive a cycle of a rehearsal (in the paper 97.66 % of the target after
-one)."""
+"""Fraction of the atoms that survive a cycle of a rehearsal (in the paper 97.66 % of the target do)."""
 
 
 class FirstCycle(NamedTuple):

@@ -274,4 +274,4 @@ def taken_again(path: Path, given: Options, *, same_seed: bool) -> tuple[Assembl
     assembly = assemble_recorded(files_of(run)._replace(calibrations=None), options)
     today, asked_for = record_today(run, assembly, options.changes()), {"seed", "shots"}
     changes = (change for change in changes_between(run, today) if change.what not in asked_for)
-    return assembly, options, [f"other than in {run.path.name}: {change}" for change in changes]
+    return assembly, options, [f"changed since {run.path.name}: {change}" for change in changes]

@@ -20,15 +20,15 @@ __all__ = ["stopped", "stopped_home"]
 
 
 CHANGES: dict[str, tuple[Any, str]] = {
-    "version": (lambda r: r["provenance"].update(labseq="0.0.1"), r"labseq was 0\.0\.1, is \d"),
+    "version": (lambda r: r["provenance"].update(labseq="0.0.1"), r"labseq was 0\.0\.1 and is now \d"),
     "commit": (
         lambda r: r["provenance"].update(git={"code": {"commit": "a" * 40, "dirty": False}}),
-        r"labseq's commit was a+, is (null|[0-9a-f]{40})",
+        r"labseq's commit was a+ and is now (null|[0-9a-f]{40})",
     ),
-    "plugin": (lambda r: r["plugins"][0].update(version="7"), r"plugin .*: version was 7, is "),
+    "plugin": (lambda r: r["plugins"][0].update(version="7"), r"plugin .*: version was 7 and is now "),
     "setting": (
         lambda r: r["resolved"]["planner"].update(degree_of_parallelism=3),
-        r"planner\.degree_of_parallelism was 3, is 7",
+        r"planner\.degree_of_parallelism was 3 and is now 7",
     ),
 }
 
@@ -77,8 +77,8 @@ def test_uncommitted_code_is_compared(stopped: Path) -> None:
         == []
     )
     for then_code, now_code, words in (
-        (None, clean, r"commit was null, is a"),
-        (clean, {**clean, "commit": "b"}, r"commit was a, is b"),
+        (None, clean, r"commit was null and is now a"),
+        (clean, {**clean, "commit": "b"}, r"commit was a and is now b"),
         (clean, patched, r"uncommitted code .*bbbbbbbbbbbb"),
     ):
         (change,) = changes(then_code, now_code)
@@ -88,10 +88,10 @@ def test_uncommitted_code_is_compared(stopped: Path) -> None:
 @pytest.mark.parametrize(
     ("was", "now", "change"),
     [
-        (b"if x:\n    y = 1\n", b"if x:\ny = 1\n", "line 2 was '    y = 1\\n', is 'y = 1\\n'"),
-        (b"a\nb\n", b"a\r\nb\r\n", "line 1 was 'a\\n', is 'a\\r\\n'"),
-        (b"-" * 70 + b"1", b"-" * 70 + b"2", f"was '{'-' * 30}1', is '{'-' * 30}2'"),
-        (b"# \xb5", b"# \xe4", r"line 1 was '# \udcb5', is '# \udce4'"),
+        (b"if x:\n    y = 1\n", b"if x:\ny = 1\n", "line 2 was '    y = 1\\n' and is now 'y = 1\\n'"),
+        (b"a\nb\n", b"a\r\nb\r\n", "line 1 was 'a\\n' and is now 'a\\r\\n'"),
+        (b"-" * 70 + b"1", b"-" * 70 + b"2", f"was '{'-' * 30}1' and is now '{'-' * 30}2'"),
+        (b"# \xb5", b"# \xe4", r"line 1 was '# \udcb5' and is now '# \udce4'"),
     ],
 )
 def test_the_first_line_that_differs_shows_the_difference(was: bytes, now: bytes, change: str) -> None:

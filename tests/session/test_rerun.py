@@ -75,4 +75,4 @@ def test_a_run_is_taken_again(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="shots is 0"):
         labseq.Session.rerun(first.path, shots=0)
     (text,) = [values["text"] for values in seen.of("warning") if "other than" in values["text"]]
-    assert text == f"other than in {first.path.name}: labseq was 0.1.9, is {labseq.__version__}"
+    assert text == f"changed since {first.path.name}: labseq was 0.1.9 and is now {labseq.__version__}"

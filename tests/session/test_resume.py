@@ -172,7 +172,7 @@ REFUSED: dict[str, tuple[Any, type[Exception], str]] = {
     "another number of shots": (
         lambda run: changed(run, lambda r: r.update(n_shots=9)),
         ConfigError,
-        "shots would differ today: n_shots was 9, is 6",
+        "shots would differ today: n_shots was 9 and is now 6",
     ),
     "another text": (
         lambda run: (run / "sequence.yaml").write_text("labseq: 1\n"),
