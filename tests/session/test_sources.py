@@ -143,7 +143,7 @@ def test_an_edited_step_is_in_the_record_and_resume_shows_the_line(lab: Path) ->
     )
     with pytest.raises(ConfigError) as caught:
         resumed(before.path)
-    change = "plugin blinking: core.py, line 10 was 'brightness = 1', is 'brightness = 2'"
+    change = "plugin blinking: core.py, line 10 was 'brightness = 1' and is now 'brightness = 2'"
     assert [problem.what for problem in caught.value.problems][:-1] == [change]
     after = labseq.open_run(interrupted(lab / "s.yaml", "shot_started", 1, **quick))
     (old, new) = (
