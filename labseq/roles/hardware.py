@@ -296,7 +296,7 @@ class MobileTweezers(Hardware):
 
     @property
     def beginning_s(self) -> float:
-        """Playing time of the beginning if a program is cut and :meth:`append` sends the rest. inf if never.
+        """Shortest playing time of a beginning whose rest can follow by :meth:`append`. inf for never.
 
         It is long enough to compute the rest meanwhile. Tones are off where a program is cut.
         """
