@@ -5,11 +5,11 @@ The tree::
     /                        values that hold for the whole run, as attributes
       table                  NXdata: a column for each value of the shots, as in ``Run.to_dataframe``
       run/<file>             the files of the run's folder: run.json, sequence.yaml, calibrations, ...
-      shots/shot_000000      the content of /entry in the shot's file; also for failed attempts
+      shots/shot_000000      the content of /entry in the shot's file, also for failed attempts
 
 Settings, devices and target are the same in all shots. The file holds them once, and the shots have hard
-links to them. Axes have dimension scales, from which xarray and netCDF take their names; the shots' own files
-have none, as they would double the time that writing a shot takes.
+links to them. Axes have dimension scales, from which xarray and netCDF take their names. The shots' own files
+have no scales because these would double the time to write a shot.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ FORMAT: Final = "labseq-archive"
 FORMAT_VERSION: Final = "4.0"
 
 _ROWS: Final = {table.path.rpartition("/")[2]: table.row for table in schema.TABLES}
-"""Name of a table -> what a row describes, which is the name of its axis."""
+"""Name of a table -> what one row describes, which is also the name of its axis."""
 
 
 def write_archive(run: Run, path: Path, *, frames: bool) -> list[str]:
-    """Write the archive of a run; the file appears only when it is complete.
+    """Write the archive of a run. The file appears only when it is complete.
 
     Returns:
-        Why shots were left out: files that are missing or damaged. Empty if all are in it.
+        Why shots were left out, because their files are missing or damaged. Empty if all are in it.
 
     Raises:
-        OSError: It cannot be written.
-        RuntimeError: It cannot be written; HDF5 raises either error.
+        OSError: The file cannot be written.
+        RuntimeError: The file cannot be written. HDF5 raises either error.
     """
     left_out: list[str] = []
     with whole_file(path) as part, h5py.File(Path(part.name), "w", libver=schema.LIBRARY_VERSIONS) as file:
@@ -83,7 +83,7 @@ def _write_table(group: h5py.Group, run: Run) -> None:
 
 
 def _write_files(group: h5py.Group, run_dir: Path) -> list[str]:
-    """Copy the files of the run's folder: texts as text, others as bytes; returns what was left out."""
+    """Copy the files of the run's folder, text as text and others as bytes. Return a list of omissions."""
     left_out: list[str] = []
     results = group.create_group(folders.RESULTS_FOLDER)
     for goal, folder in ((group, run_dir), (results, run_dir / folders.RESULTS_FOLDER)):
@@ -111,7 +111,7 @@ def _write_file(group: h5py.Group, name: str, data: bytes) -> None:
 
 
 class _Shots:
-    """Copies shots into a group; equal groups ``run`` and ``target`` are shared."""
+    """Copies shots into a group, which share equal groups ``run`` and ``target``."""
 
     def __init__(self, group: h5py.Group, *, frames: bool) -> None:
         self._group = group
@@ -119,12 +119,12 @@ class _Shots:
         self._shared: dict[str, tuple[Any, Any]] = {}  # name -> content, group
 
     def add(self, shot: Shot) -> None:
-        """Copy a shot whose file is whole.
+        """Copy a shot whose file is undamaged.
 
         Raises:
-            RecordingError: Its frames are compressed and the package for it is missing.
+            RecordingError: Its frames are compressed and the package to read them is missing.
         """
-        with opened(shot.file) as entry:  # refuses what would lead out of the file
+        with opened(shot.file) as entry:  # refuses links that lead out of the file
             content_of(entry)
             check_attributes(entry.file)
         with open_finished(shot.file) as source:
@@ -160,7 +160,7 @@ class _Shots:
 
 
 def _name_axes(node: Any) -> None:
-    """Give every array and table in a group scales with the names of their axes; or a single one."""
+    """Attach named scales to the axes of a dataset, or of all datasets in a group."""
     if isinstance(node, h5py.Dataset):
         axes = str(read_attribute(node, "dimensions", ""))
         if node.dtype.names:
@@ -175,7 +175,7 @@ def _name_axes(node: Any) -> None:
 
 
 def _link_scales(view: Any) -> None:
-    """Put the scales of what a view of the frames links to beside the links, where netCDF looks for them."""
+    """Link the scales of the frames that a view shows into the view, where netCDF looks for them."""
     folder = view.get("frames", getlink=True).path.rpartition("/")[0]
     for name, node in view.file[folder].items():
         if node.is_scale and name not in view:
@@ -183,7 +183,7 @@ def _link_scales(view: Any) -> None:
 
 
 def _attach(dataset: Any, axes: Sequence[str]) -> None:
-    """Attach the scale of each axis, which is made beside the first array that has it."""
+    """Attach the scale of each axis. It is created next to the first array that needs it."""
     for axis, (name, length) in enumerate(zip(axes, dataset.shape, strict=True)):
         if name not in dataset.parent:
             indices = dataset.parent.create_dataset(name, data=np.arange(length))
@@ -196,7 +196,7 @@ def _attach(dataset: Any, axes: Sequence[str]) -> None:
 
 
 def _copy(source: Any, copy: Any, name: str, *, frames: bool) -> None:
-    """Copy one item of a group; large arrays are compressed, and frames left out if not requested."""
+    """Copy one item of a group. Large arrays are compressed, and frames are copied only if requested."""
     link = source.get(name, getlink=True)
     if isinstance(link, h5py.SoftLink):  # leads to the frames of the same shot
         shot = "/".join(copy.name.split("/")[:3])
@@ -213,7 +213,7 @@ def _copy(source: Any, copy: Any, name: str, *, frames: bool) -> None:
     if is_image and not frames:
         return
     is_compressed = node.id.get_create_plist().get_nfilters() > 0
-    # smaller arrays would grow: compression needs chunks, and each chunk an entry in their index
+    # smaller arrays would grow, because compression needs chunks, and each chunk an entry in their index
     if node.dtype.kind != "O" and (node.nbytes >= 1024 or is_compressed):
         chunks = (1, *node.shape[1:]) if is_image else True  # one frame is read without its neighbours
         packing = {"compression": "gzip", "compression_opts": 4, "shuffle": True}

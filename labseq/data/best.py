@@ -1,4 +1,4 @@
-"""The best shot of a run; the best point of an adaptive scan, and what a parabola suggests."""
+"""The best shot of a run, and the best point of an adaptive scan with the extremum of a parabola."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class BestPoint:
     """The result of an adaptive scan.
 
     Attributes:
-        quantity: What was optimised.
+        quantity: The quantity that was optimised.
         point: The point with the best mean.
         value: The mean there.
         suggested: Address -> the extremum of a parabola through the points near it, in the units of the
-            sequence; the best value where the points have no extremum.
-        is_fitted: Whether some value is such an extremum.
+            sequence. The best value where the points have no extremum.
+        is_fitted: True if at least one value is such an extremum.
     """
 
     quantity: Quantity
@@ -39,7 +39,7 @@ class BestPoint:
     is_fitted: bool
 
     def as_json(self) -> dict[str, Any]:
-        """The result, JSON-ready."""
+        """The result as JSON-ready values."""
         return {
             "figure": self.quantity.name,
             "best": dict(self.point.written),
@@ -55,11 +55,11 @@ class BestShot:
     """The shot that came nearest to the target.
 
     Attributes:
-        shot: Its index.
-        success: Whether it met the target on its last image; None if that cannot be told.
+        shot: Index of the shot.
+        success: Whether it met the target on its last image. None if this is unknown.
         filling: Fraction of the target's sites that held an atom on its last image.
         n_cycles: Number of rearrangement cycles that it took.
-        duration_s: Sum of its steps.
+        duration_s: Sum of the durations of its steps.
     """
 
     shot: int
@@ -70,10 +70,10 @@ class BestShot:
 
 
 def best_shot(run: Run) -> BestShot | None:
-    """A shot that met the target, else the fullest; of equal ones that with the fewest cycles.
+    """A shot that met the target, otherwise the fullest one. Among equals, the one with the fewest cycles.
 
     Returns:
-        None for a run without a target, or of which no shot could be judged.
+        None if the run has no target, or no shot could be judged.
     """
     judged = [
         BestShot(row.shot, row.success, row.filling_fraction, row.n_cycles, row.duration_s)
@@ -88,7 +88,7 @@ def best_shot(run: Run) -> BestShot | None:
 
 
 def best_point(run: Run) -> BestPoint | None:
-    """The best point of a run's adaptive scan; None without one, or if no shot has its quantity.
+    """The best point of a run's adaptive scan. None without such a scan, or if no shot has its quantity.
 
     Raises:
         RecordingError: The scan's record in run.json is damaged.
@@ -126,12 +126,12 @@ def extremum(
 ) -> NDArray[np.float64]:
     """Distance of a parabola's maximum from the best point, along each axis.
 
-    The parabola, without mixed terms, is fitted to the nearer half of the points, weighted with their
-    errors. Where it has no maximum within these points, the answer is 0.
+    A parabola without mixed terms is fitted to the nearer half of the points, weighted with their
+    errors. Where it has no maximum within these points, the distance is 0.
 
     Args:
         places: float64 (n_points, n_axes), from 0 to 1.
-        scores: float64 (n_points,), the more the better.
+        scores: float64 (n_points,). Higher is better.
         values: The same with their errors.
         best: Index of the best point.
 
@@ -151,7 +151,7 @@ def extremum(
         [(high - low) / 2 for low, high in (values[i].interval for i in nearest)] if values else []
     )
     known_errors = errors[np.isfinite(errors) & (errors > 0)]
-    # a point without an error of its own, such as one of a single shot, counts as the worst of the others
+    # a point without an error, such as a single shot, counts as the worst of the others
     weights = (
         1 / np.where(np.isfinite(errors) & (errors > 0), errors, known_errors.max())
         if len(known_errors)

@@ -1,4 +1,4 @@
-"""The runs in a data folder: what each was and what it measured, found without opening its shots."""
+"""The runs in a data folder: settings and results of each, found without opening its shots."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from labseq.recording.folders import INDEX_FILE, RESULTS_FOLDER
 from labseq.recording.listing import newest_first
 
 SETTLED_S: Final = 2.0
-"""A run whose files changed within this time is not kept: another change could leave the same time."""
+"""A run whose files changed within this time is not cached: another change could get the same time."""
 
 
 def runs(
@@ -40,16 +40,16 @@ def runs(
 ) -> Iterator[RunEntry]:
     """The runs in a data folder that meet all conditions, the newest first.
 
-    A run is looked up when it is its turn: ``next(labseq.runs(sequence="lifetime"))`` reads no older ones.
+    Runs are read one at a time: ``next(labseq.runs(sequence="lifetime"))`` reads no older ones.
 
     Args:
-        folder: The data folder; by default LABSEQ_DATA or ``./data``.
+        folder: The data folder. Default LABSEQ_DATA or ``./data``.
         since: First day, "2026-11-20" or a date.
         until: Last day.
         sequence: Name of the sequence, or of its file.
         tag: A tag.
         status: "running", "complete", "stopped", "failed" or "damaged".
-        search: Words that names, note, tags, status, scanned addresses, changed settings or results contain.
+        search: Words to look for in names, note, tags, status, scanned addresses, changes and results.
         where: Conditions on results, changed settings and numbers of shots: "decay > 2 s", "shots >= 100".
 
     Raises:
@@ -83,7 +83,7 @@ def _day(name: str, day: str | date) -> str:
 
 
 def _condition(text: str) -> Callable[[RunEntry], bool]:
-    """A condition on a run; a run that has no value of its name does not meet it."""
+    """A condition on a run. A run without the named value does not meet it."""
     from labseq.data.conditions import Condition  # with numpy, which a list without conditions does not load
 
     condition = Condition.of(text)
@@ -99,7 +99,7 @@ def _condition(text: str) -> Callable[[RunEntry], bool]:
 
 
 class Kept(NamedTuple):
-    """What is kept of a run: the state of its files, what a search looks through, and its entry as JSON."""
+    """What the cache holds for a run: state of its files, the text to search, and its entry as JSON."""
 
     stamp: str
     text: str
@@ -107,15 +107,15 @@ class Kept(NamedTuple):
 
 
 def entries(root: Path, names: Iterable[tuple[str, str]], words: Sequence[str] = ()) -> Generator[RunEntry]:
-    """The entries of runs in a data folder: kept ones, as far as the runs' files have not changed since.
+    """The entries of runs in a data folder. They are cached until the runs' files change.
 
-    They are kept in a file in the user's cache, which may be deleted at any time. The number in the name
-    of its table is counted up when what is kept of a run has another meaning.
+    The cache is a file in the user's cache folder, which may be deleted at any time. Count up the number in
+    the name of its table when the meaning of a cached value changes.
 
     Args:
         root: The data folder.
         names: Day and name of each run.
-        words: Only entries whose text contains all of these, in lower case.
+        words: Only entries whose text contains all of these words, in lower case.
     """
     connection, new = _connected(root), dict[str, Kept]()
     kept_day, kept = "", dict[str, Kept]()
@@ -147,7 +147,7 @@ def _contains(text: str, words: Sequence[str]) -> bool:
 
 
 def _stamp(folder: str) -> str:
-    """The times of what can change in a run that has ended; "" if a change is too recent.
+    """The times of files that can change in a run that has ended. "" if a change is too recent.
 
     Whole files, such as STATE and the notes, are replaced, which changes the time of the folder. Lines are
     added to the index when a run is resumed, and to results when it is analysed again.
@@ -163,7 +163,7 @@ def _stamp(folder: str) -> str:
 
 
 def _changed(path: str) -> tuple[int, ...]:
-    """When a file or folder was changed, in ns, and its size; nothing if there is none."""
+    """When a file or folder was changed, in ns, and its size. Empty if it does not exist."""
     try:
         about = os.stat(path)  # noqa: PTH116 - making paths would take most of the time
     except OSError:
@@ -172,7 +172,7 @@ def _changed(path: str) -> tuple[int, ...]:
 
 
 def _decoded(folder: str, text: str) -> RunEntry | None:
-    """A kept entry; None if it cannot be read."""
+    """A cached entry. None if it cannot be read."""
     try:
         values: dict[str, Any] = json.loads(text)
         results = [Result(one["name"], Parameter(**one["value"]), one["at"]) for one in values["results"]]
@@ -183,7 +183,7 @@ def _decoded(folder: str, text: str) -> RunEntry | None:
 
 
 def _connected(root: Path) -> sqlite3.Connection | None:
-    """The file of a data folder's entries; None for a user without a home, room or permission."""
+    """The cache of a data folder. None without a home folder, space or permission."""
     digest = hashlib.sha256(str(root.resolve()).encode("utf-8", "surrogateescape")).hexdigest()
     columns = "name text primary key, stamp text, text text, entry text"
     with suppress(RuntimeError, OSError, sqlite3.OperationalError):
@@ -196,13 +196,13 @@ def _connected(root: Path) -> sqlite3.Connection | None:
             return connection
         except sqlite3.DatabaseError as error:
             connection.close()
-            if not isinstance(error, sqlite3.OperationalError):  # it is damaged; the next list makes it again
+            if not isinstance(error, sqlite3.OperationalError):  # it is damaged, the next list makes it again
                 file.unlink()
     return None
 
 
 def _kept(connection: sqlite3.Connection | None, day: str) -> dict[str, Kept]:
-    """What is kept of the runs of a day, by day and name."""
+    """The cached entries of the runs of a day, by day and name."""
     with suppress(sqlite3.Error):
         if connection is not None:
             of_day = "select * from runs_3 where name >= ? and name < ?"  # "0" is the character after "/"
@@ -212,7 +212,7 @@ def _kept(connection: sqlite3.Connection | None, day: str) -> dict[str, Kept]:
 
 
 def _keep(connection: sqlite3.Connection | None, new: Mapping[str, Kept]) -> None:
-    """Keep new entries, and close the file; what cannot be kept is read again next time."""
+    """Store new entries and close the cache. Entries that cannot be stored are read again next time."""
     if connection is None:
         return
     with suppress(sqlite3.Error), closing(connection):

@@ -1,4 +1,4 @@
-"""The shots of a run as columns, from the index alone: one value of each shot, with its unit."""
+"""The shots of a run as columns, read from the index alone: one value per shot, with its unit."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _FIELDS: Final = tuple(field for field in schema.IN_INDEX if field.name != "erro
 DESCRIPTIONS: Final = {field.name: field.description for field in _FIELDS} | {
     name: description for name, (description, _) in _DERIVED.items()
 }
-"""Column of every run -> its description."""
+"""Columns that every run has -> their descriptions."""
 _TEXTS: Final = frozenset({"file", *(field.name for field in _FIELDS if field.dtype == "text")})
 
 QUANTITIES: Final = tuple(name for name in DESCRIPTIONS if name not in {*_TEXTS, "shot", "attempt"})
@@ -71,10 +71,10 @@ class Column:
     """One value of each shot.
 
     Attributes:
-        name: Its name.
-        values: (n_shots,): bool, int64, float64 with nan for a missing value, or str objects with "".
-        units: SI unit; "" for none.
-        description: Its description.
+        name: Name of the column.
+        values: Array (n_shots,) of bool, int64, float64 with nan if missing, or str objects with "".
+        units: SI unit. "" for none.
+        description: Description of the column.
     """
 
     name: str
@@ -91,10 +91,10 @@ def make_column(
 
 
 def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
-    """The shots of a run as columns, from the index alone.
+    """The shots of a run as columns, read from the index alone.
 
     Args:
-        shots: The shots of the rows; by default those that count.
+        shots: The shots of the rows. Default: the shots that count.
     """
     rows = [shot.row for shot in (run.shots if shots is None else shots)]
     results = result_columns(run.path)
@@ -110,7 +110,7 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
         groups = [values_of(row) for row in rows]
         for name in dict.fromkeys(name for group in groups for name in group):
             full_name = _column_name(prefix, name)
-            # a parameter may be called as a fixed column is
+            # a parameter may have the same name as a fixed column
             while full_name in names:
                 full_name += "_"
             names.add(full_name)
@@ -118,7 +118,7 @@ def columns_of(run: Run, shots: Sequence[Shot] | None = None) -> list[Column]:
             description = _description(prefix, name, scanned=name in scanned)
             columns.append(make_column(full_name, [group.get(name) for group in groups], units, description))
     for name, values in results.items():
-        # only attempts that count are analysed: a failed one has the same number of shot
+        # only attempts that count are analysed, but a failed one has the same shot number
         row_values = [values.get(row.shot) if row.counts else None for row in rows]
         columns.append(make_column(name, row_values, unit_of(name), RESULT))
     return columns
@@ -136,8 +136,8 @@ def quantities_in(row: IndexRow) -> dict[str, float]:
     """The quantities (numerical results) of a shot, from its line in the index.
 
     Returns:
-        Name -> value, as :meth:`labseq.Run.to_dataframe` calls its column: "filling_fraction",
-        "stage.plan_s", "reading.laser.power_w"; without those that are nan.
+        Name -> value, with the column names of :meth:`labseq.Run.to_dataframe`: "filling_fraction",
+        "stage.plan_s", "reading.laser.power_w". Values that are nan are left out.
     """
     values = {name: value for name, value in _fixed(row).items() if name in QUANTITIES}
     for prefix in ("stage.", "reading."):
@@ -172,7 +172,7 @@ def _array(values: Sequence[Any], *, text: bool = False) -> NDArray[Any]:
             return np.array(values, np.bool_)
         if kinds == {int}:
             return np.array(values, np.int64)
-        # numpy has no missing integer: a column with gaps is of floats
+        # numpy has no missing integer, so a column with gaps is of floats
         return np.array([math.nan if value is None else value for value in values], np.float64)
     return np.array([_text(value) for value in values], object)
 

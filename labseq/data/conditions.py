@@ -1,4 +1,4 @@
-"""Conditions such as "filling:before == 1", which choose shots of a run, and runs of a data folder."""
+"""Conditions such as "filling:before == 1", which select shots of a run or runs of a data folder."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Condition:
     Attributes:
         name: Name of the value.
         comparison: One of ``==``, ``!=``, ``>=``, ``<=``, ``>`` and ``<``.
-        limit: As it was typed.
+        limit: The limit as it was typed.
     """
 
     name: str
@@ -45,22 +45,22 @@ class Condition:
 
     @classmethod
     def of(cls, text: str) -> Self:
-        """The condition in a text.
+        """Parse a condition.
 
         Raises:
-            ConfigError: It is not one.
+            ConfigError: The text is not a condition.
         """
         match = re.match(r"\s*(\S+?)\s*(==|!=|>=|<=|>|<)\s*(\S.*?)\s*\Z", text)
         if match is None:
-            message = f"this is not a condition: '{clean(text)}'"
+            message = f"'{clean(text)}' is not a condition"
             raise ConfigError(Problem(message, "--where", expected="for example 'filling:before == 1'"))
         return cls(*match.groups())
 
     def of_numbers(self, unit: str = "") -> Callable[[float], bool]:
-        """The condition on a number, SI, which nan never meets.
+        """The condition as a function of a number in SI. It is false for nan.
 
         Args:
-            unit: SI unit of the number; "" for a fraction, or if it is unknown.
+            unit: SI unit of the number. "" for a fraction, or if it is unknown.
 
         Raises:
             ConfigError: The limit is not a number, or has another unit.
@@ -77,10 +77,10 @@ class Condition:
         return lambda value: not math.isnan(value) and _COMPARISONS[self.comparison](value, limit)
 
     def of_texts(self) -> Callable[[str], bool]:
-        """The condition on a text.
+        """The condition as a function of text.
 
         Raises:
-            ConfigError: It is not one of equality.
+            ConfigError: The comparison is not == or !=.
         """
         if self.comparison not in ("==", "!="):
             what = f"'{self.comparison}' does not compare text"
@@ -102,7 +102,7 @@ def select_shots(run: Run, conditions: Iterable[str]) -> tuple[Shot, ...]:
 
 
 def _meets(run: Run, condition: Condition) -> Callable[[Shot], bool]:
-    """Whether a shot meets a condition on a column of the export, or on a quantity."""
+    """A function that tells whether a shot meets a condition on an exported column or a quantity."""
     name, columns = condition.name, {column.name: column for column in columns_of(run)}
     if name in columns:
         values, unit = columns[name].values, columns[name].units

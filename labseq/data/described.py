@@ -1,4 +1,4 @@
-"""What a run's files say about it, for the list of runs."""
+"""Reads what the list of runs shows about a run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from labseq.recording.notes import read_notes
 
 
 def read_entry(folder: Path) -> RunEntry:
-    """Read a run's files."""
+    """Read a run's files. A damaged run gives an entry with the error."""
     notes = read_notes(folder)
     entry = RunEntry(folder, note=notes.comment, tags=notes.tags)
     try:
@@ -52,7 +52,7 @@ def _described(entry: RunEntry) -> RunEntry:
 
 
 def _measured(run: Run) -> dict[str, Any]:
-    """What was scanned and measured; a scan or a result that is damaged is left out."""
+    """The scanned values and the results. A damaged scan or result is left out."""
     values: dict[str, Any] = {}
     with suppress(LabseqError, LookupError, TypeError, ValueError):
         scan = scanned(run)

@@ -1,4 +1,4 @@
-"""A run as a line of the list of runs, without its shots."""
+"""A run as an entry in the list of runs, without its shots."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RunEntry:
-    """A run in a data folder; of a damaged one only its folder, its notes and the error are known.
+    """A run in a data folder. If it is damaged, only its folder, its notes and the error are known.
 
     Attributes:
         path: The run's folder.
-        t_start_utc: When it began, ISO 8601, UTC; "" if unknown.
+        t_start_utc: When it began, ISO 8601, UTC. "" if unknown.
         name: Name of the sequence.
         sequence: Name of the sequence's file, without folder and ending.
         profile: Name of the hardware profile.
@@ -29,17 +29,17 @@ class RunEntry:
         status: "running", "complete", "stopped", "failed" or "damaged".
         error: Why it failed or cannot be read.
         simulated: Whether all hardware was simulated.
-        seed: Its seed.
+        seed: Seed of the run.
         shots: Number of shots that count.
         n_shots: Number of shots that were asked for.
         bytes: Size of the shots' files.
-        scanned: Scanned address -> its values in words: "1 ms to 20 ms, 8 values".
-        changes: Settings changed by ``--set`` and other options: address -> value, as it was typed.
-        settings: The same in SI units.
+        scanned: Scanned address -> its values in words, such as "1 ms to 20 ms, 8 values".
+        changes: Address -> value, as typed, of settings changed by ``--set`` and other options.
+        settings: The same values in SI units.
         calibrations: Kind -> id of the calibrations in use.
-        results: What it measured, the most important first.
-        note: The note about it.
-        tags: Its tags.
+        results: Its results, the most important first.
+        note: The note about the run.
+        tags: Tags of the run.
     """
 
     path: Path
@@ -65,24 +65,24 @@ class RunEntry:
 
     @property
     def id(self) -> str:
-        """Its whole name: "2026-11-20/0075_lifetime"."""
+        """The whole name of the run, such as "2026-11-20/0075_lifetime"."""
         return f"{self.path.parent.name}/{self.path.name}"
 
     @property
     def number(self) -> str:
-        """The shortest name that is its own: "2026-11-20/75"."""
+        """The shortest name that identifies the run, such as "2026-11-20/75"."""
         return f"{self.path.parent.name}/{counter_of(self.path.name)}"
 
     @property
     def scanned_text(self) -> str:
-        """What it scanned, in a line: "hold.duration 1 ms to 20 ms, 8 values"."""
+        """The scanned values in one line, such as "hold.duration 1 ms to 20 ms, 8 values"."""
         short = (re.sub(r"^(shot|profile)\.", "", address) for address in self.scanned)
         return "; ".join(map(" ".join, zip(short, self.scanned.values(), strict=True)))
 
     @property
     def values(self) -> dict[str, Any]:
-        """Every value that a condition can name: results, settings, "shots", "n_shots"; SI."""
-        # reversed: of two results with one name the first counts, which is the more important one
+        """Every value that a condition can name: results, settings, "shots" and "n_shots", in SI."""
+        # reversed: of two results with one name the first counts because it is more important
         results = {result.name: result.value.value for result in reversed(self.results)}
         counts = {"shots": self.shots, "n_shots": self.n_shots}
         return {
@@ -91,7 +91,7 @@ class RunEntry:
 
     @property
     def text(self) -> str:
-        """What a search looks through: names, notes, settings and results, in lower case."""
+        """The text that a search looks through: names, notes, settings and results, in lower case."""
         settings = (f"{address}={value}" for address, value in self.changes.items())
         words = (
             self.id,
@@ -111,7 +111,7 @@ class RunEntry:
         """Open the run.
 
         Raises:
-            RecordingError: It is damaged.
+            RecordingError: The run is damaged.
         """
         from labseq.data.reader import open_run  # takes longer than a list of 10,000 runs
 

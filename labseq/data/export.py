@@ -21,7 +21,7 @@ ENDINGS: Final = {"csv": ".csv", "parquet": ".parquet", "netcdf": ".nc", "archiv
 
 
 def files_of(kind: str, path: Path) -> tuple[Path, ...]:
-    """The files that an export writes; a table of units is written next to a CSV file.
+    """The files that an export writes. A table of units is written next to a CSV file.
 
     Example:
         >>> [file.name for file in files_of("csv", Path("run.csv"))]
@@ -31,10 +31,10 @@ def files_of(kind: str, path: Path) -> tuple[Path, ...]:
 
 
 def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool = False) -> None:
-    """Check whether a run can be exported, before anything is read.
+    """Check that a run can be exported, before anything is read.
 
     Raises:
-        ConfigError: It cannot be exported; says what was expected.
+        ConfigError: It cannot be exported. The message says what to change.
     """
     if kind not in ENDINGS:
         raise ConfigError(
@@ -52,10 +52,10 @@ def check_export(kind: str, path: Path, *, frames: bool = False, replace: bool =
 
 
 def export_run(run: Run, kind: str, path: Path, *, frames: bool = False) -> list[str]:
-    """Write a run to a file, which appears only when it is complete; call :func:`check_export` first.
+    """Write a run to a file, which appears only when it is complete. Call :func:`check_export` first.
 
     Returns:
-        One line for each shot that an archive lacks because its file is damaged.
+        One line for each shot that the archive lacks because its file is damaged.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -96,7 +96,7 @@ def write_rows(path: Path, rows: Iterable[Iterable[object]]) -> None:
 
 
 def _cell(value: Any) -> str:
-    """A value as text that every program can read; empty for nan."""
+    """A value as text that every program can read. Empty for nan."""
     if isinstance(value, bool):
         return "true" if value else "false"
     return "" if value != value else str(value)  # only nan differs from itself

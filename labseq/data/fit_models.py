@@ -15,26 +15,26 @@ from labseq.data.least_squares import Floats, minimise
 from labseq.model.estimate import Estimate
 
 RB87_U, ATOMIC_MASS_KG = 86.909180531, 1.66053906660e-27
-"""Mass of 87Rb (AME2020), and the unit that it is in (CODATA 2018)."""
+"""Mass of 87Rb (AME2020) in atomic mass units, and the atomic mass unit in kg (CODATA 2018)."""
 N_STEPS: Final = 600
-"""Points at which their distribution is integrated."""
+"""Number of points at which the distributions of atoms are integrated."""
 FURTHEST: Final = 3.0
-"""Largest distance of an atom from the focus in Rayleigh lengths, where the intensity is a tenth. Without an
-end, there would be infinitely many atoms that are barely bound."""
+"""Largest distance of an atom from the focus in Rayleigh lengths, where the intensity is a tenth. Without a
+limit, there would be infinitely many barely bound atoms."""
 ETA_STEP: Final = 0.05
-"""Step of the logarithm of a trap's depth in units of kT; recapture is linear within 0.001 between two."""
+"""Step of the logarithm of a trap's depth in kT. Between two steps, recapture is linear within 0.001."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """The points of a fit, in rising order of x; float64 (n_points,) each.
+    """The points of a fit in rising order of x, each float64 (n_points,).
 
     Attributes:
         x: The scanned values, SI.
         y: The values there.
-        error: Their standard errors; 1 for all if none is known.
-        has_errors: Whether any is known; otherwise the scatter about the fit takes their place.
-        n_trials: Number of trials of a rate; 0 for another quantity.
+        error: Their standard errors. 1 for all points if none is known.
+        has_errors: Whether any error is known. If not, the scatter about the fit is used instead.
+        n_trials: Number of trials of a rate. 0 for any other quantity.
     """
 
     x: Floats
@@ -44,15 +44,15 @@ class Points:
     n_trials: Floats
 
     def scale(self, unit: str) -> float:
-        """The range of the points in a parameter's unit, see :class:`FitModel`; 0 for another unit."""
+        """The range of the points in the unit of a parameter, see :class:`FitModel`. 0 for another unit."""
         ranges = {"x": float(np.ptp(self.x)), "y": float(np.ptp(self.y)), "1": 1.0, "rad": 1.0}
         numerator, _, denominator = unit.partition("/")
         power = float(denominator.partition("^")[2] or 1) if denominator else 0.0
         return ranges.get(numerator, 0.0) / ranges["x"] ** power
 
     def with_errors_of(self, probabilities: Floats) -> Points:
-        """The points with the errors that rates of these probabilities have."""
-        # half an event more of either kind, so that 0 and 1 have an error, too
+        """The points, with the errors that rates with these probabilities have."""
+        # half an event of either kind is added so that rates of 0 and 1 have an error, too
         expected = (self.n_trials * probabilities.clip(0.0, 1.0) + 0.5) / (self.n_trials + 1)
         error = np.sqrt(expected * (1 - expected) / np.maximum(self.n_trials, 1))
         return replace(self, error=np.where(self.n_trials > 0, error, self.error))
@@ -60,11 +60,11 @@ class Points:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """The parameters that fit best.
+    """The result of a fit: the best parameters and the fitted function.
 
     Attributes:
-        values: Parameter -> its value with its error, which is 0 if it was fixed.
-        reduced_chi_square: nan if the points have no errors.
+        values: Parameter -> its value and error. The error is 0 if it was fixed.
+        reduced_chi_square: Reduced chi-square. nan if the points have no errors.
         function: The fitted function of x.
     """
 
@@ -83,15 +83,15 @@ class FitModel:
     """A function that can be fitted.
 
     Attributes:
-        formula: The function of x.
+        formula: The function of x as text.
         units: Parameter -> its unit: an SI unit, or "x", "y", "1/x", "y/x", "y/x^2", ... of the points.
-        evaluate: The function: x and the parameters.
-        guess: Starting values from x and y.
-        fixed: Parameters that are fixed unless the user frees them; nan if the user must give the value.
-        at_least: Smallest values.
-        relative_step: For the derivatives.
-        without: Parameters that are left out, by fixing them at these values, if the fit fails with them.
-        significance: Parameters that must differ from 0 by so many of their errors: noise has them too.
+        evaluate: Computes the function from x and the parameters.
+        guess: Computes starting values from x and y.
+        fixed: Parameters that are fixed unless the user frees them. nan if the user must give the value.
+        at_least: Parameter -> its smallest value.
+        relative_step: Relative step of the derivatives.
+        without: Parameter -> the value at which it is fixed if the fit fails with it free.
+        significance: Parameter -> how many of its errors it must differ from 0, to tell it from noise.
         advice: What helps if the points do not determine the parameters.
     """
 
@@ -104,17 +104,17 @@ class FitModel:
     relative_step: float = 1e-7
     without: Mapping[str, float] = field(default_factory=dict[str, float])
     significance: Mapping[str, float] = field(default_factory=dict[str, float])
-    advice: str = "points that follow the model, over a wider range; or fewer parameters (--fit-set)"
+    advice: str = "points that follow the model, over a wider range, or fewer parameters (--fit-set)"
 
     def solve(
         self, points: Points, fixed: Mapping[str, float], near: Solution | None = None
     ) -> Solution | None:
-        """Fit the parameters that are not fixed; None if that does not converge.
+        """Fit the parameters that are not fixed. None if the fit does not converge.
 
         Args:
             points: The points.
             fixed: The parameters that are fixed.
-            near: An earlier solution to start at.
+            near: An earlier solution from which the fit starts.
         """
         free = [name for name in self.units if name not in fixed]
 
@@ -144,7 +144,7 @@ class FitModel:
 
 
 def _quietly(function: Callable[[Floats], Floats], x: Floats) -> Floats:
-    """A function beyond whose range there may be values of x."""
+    """Evaluate a function without warnings, because x may have values beyond its range."""
     with np.errstate(all="ignore"):
         return function(x)
 
@@ -193,15 +193,15 @@ def _damped_cosine(
 
 
 def _guess_damped_cosine(x: Floats, y: Floats) -> dict[str, float]:
-    """Try all frequencies that the points can tell apart, each with several decays.
+    """Try all frequencies that the points can resolve, each with several decays.
 
-    With these two given, the function is linear in its quadratures and the offset. Without the decay this
+    With both given, the function is linear in its quadratures and the offset. Without the decay this
     is the periodogram of Lomb and Scargle with a free mean (Zechmeister, Kuerster, A&A 496, 577, 2009).
     """
     span = float(np.ptp(x))
-    # largest number of periods within the points for which an oscillation is searched
+    # largest number of periods within the points for which an oscillation is searched for
     highest = min(max(0.5 * span / _spacing(x), 1.0), 300.0)
-    # each number of periods within the points is a minimum of its own, so the steps are a tenth of one
+    # each number of periods within the points has its own minimum, so the steps are a tenth of a period
     frequencies = np.arange(0.3, highest + 0.1, 0.1) / span
     decays = float(np.abs(x).max()) * np.array([10.0, 1.0, 0.3])
     frequency, decay = (grid.ravel() for grid in np.meshgrid(frequencies, decays))
@@ -218,19 +218,19 @@ def _guess_damped_cosine(x: Floats, y: Floats) -> dict[str, float]:
 
 
 def _spacing(x: Floats) -> float:
-    """A typical distance of neighbouring points: the median, because some may be repeated or far away."""
+    """A typical distance between neighbouring points: the median, as some may be repeated or far away."""
     return float(np.median(np.diff(np.unique(x))))
 
 
 def _best_linear(curves: Floats, y: Floats) -> tuple[int, list[float]]:
-    """The set of curves whose linear combination is closest to the points, and its coefficients.
+    """The set of curves whose linear combination is closest to the points, and the coefficients.
 
     Args:
         curves: float64 (n_sets, n_points, n_curves).
         y: float64 (n_points,).
     """
     products = np.einsum("spi,spj->sij", curves, curves)
-    # a little of the diagonal, as curves may be equal at all points
+    # a small diagonal is added because curves may be equal at all points
     products += 1e-9 * np.einsum("sii->s", products)[:, None, None] * np.eye(curves.shape[-1])
     projections = np.einsum("spi,p->si", curves, y)
     coefficients = np.linalg.solve(products, projections[..., None])[..., 0]
@@ -297,7 +297,7 @@ def _guess_saturation(x: Floats, y: Floats) -> dict[str, float]:
 
 
 def _normal_cdf(x: Floats) -> Floats:
-    """The integral of the standard normal distribution; importing scipy's would take most of a second."""
+    """The integral of the standard normal distribution. Importing scipy's would take most of a second."""
     return np.array([0.5 * math.erfc(-one / math.sqrt(2)) for one in x])
 
 
@@ -330,21 +330,21 @@ def _rising(y: Floats, x: Floats) -> tuple[Floats, Floats]:
 
 
 LOWERING: Final = (1.6, 0.56)
-"""Scale and exponent of the energy up to which a ramp keeps atoms, relative to the depth before."""
+"""Scale and exponent of the energy below which a ramp keeps atoms, relative to the depth before."""
 
 
 def _lowering(x: Floats, temperature: float, amplitude: float, depth: float) -> Floats:
     """Fraction of atoms that stay in a tweezer whose depth is slowly reduced to a fraction x.
 
-    An adiabatic ramp keeps atoms below an energy that goes as a power of the depth; scale and exponent
-    describe atoms moved by Newton's equations in a Gaussian beam.
-    Energies are distributed as in a harmonic well.
+    An adiabatic ramp keeps atoms below an energy that scales as a power of the depth. Scale and exponent
+    describe atoms moved by Newton's equations in a Gaussian beam. Energies are distributed as in a harmonic
+    well.
 
     Args:
-        x: Depths at the end, as fractions of the one before.
-        temperature: Temperature before, in K.
+        x: Depth at the end, as a fraction of the depth before.
+        temperature: Temperature before the ramp, in K.
         amplitude: Fraction that stays if x is large.
-        depth: Depth before, in K.
+        depth: Depth before the ramp, in K.
     """
     energy = LOWERING[0] * depth / temperature * x ** LOWERING[1]
     return amplitude * (1 - np.exp(-energy) * (1 + energy + energy**2 / 2))
@@ -357,26 +357,26 @@ def _guess_lowering(x: Floats, y: Floats) -> dict[str, float]:
 
 @cache
 def _draws() -> Floats:
-    """Uniform random numbers of atoms, float64 (6, n)."""
-    # the same ones each time: a fit cannot tell noise from the effect of a parameter
+    """Uniform random numbers for the simulated atoms, float64 (6, n)."""
+    # the same ones each time, because a fit cannot tell noise from the effect of a parameter
     return np.random.default_rng(0).random((6, 20_000))
 
 
-@lru_cache(maxsize=16)  # 1 MB each; a fit, and the next fit of a run in progress, need a few of them
+@lru_cache(maxsize=16)  # 1 MB each, and a fit needs a few of them again at the next fit of a run in progress
 def _bound_atoms(eta: float) -> tuple[Floats, Floats]:
-    """Atoms of the Boltzmann distribution in a Gaussian beam, restricted to bound ones.
+    """Draw bound atoms from the Boltzmann distribution in a Gaussian beam.
 
-    Where the trap has the depth a, the density is ``exp(a) P(a)``, where ``P(a) = erf(sqrt(a)) - 2 sqrt(a /
-    pi) exp(-a)`` of the Maxwell distribution is slow enough to be bound. In a plane of constant z the
-    integral over x and y is one over a. The distributions of z, of a in its plane, and of the speed are
-    inverted one after the other.
+    Where the trap has the depth a in units of kT, the density of bound atoms is ``exp(a) P(a)``. Of the
+    Maxwell distribution, the fraction ``P(a) = erf(sqrt(a)) - 2 sqrt(a / pi) exp(-a)`` is slow enough to be
+    bound. In a plane of constant z the integral over x and y becomes one of ``exp(a) P(a) / a`` over a.
+    The distributions of z, of a in its plane, and of the speed are inverted one after the other.
 
     Args:
         eta: Depth in units of kT.
 
     Returns:
-        Positions in waists, along z in Rayleigh lengths, and velocities in units of sqrt(kT / mass); both
-        float64 (3, n_atoms).
+        Positions in waists, along z in Rayleigh lengths, and velocities in units of sqrt(kT / mass). Each
+        is float64 (3, n_atoms).
     """
     from scipy.special import gammainc, gammaincinv  # takes a moment
 
@@ -409,11 +409,11 @@ def _release_recapture(
     wavelength: float,
     mass: float,
 ) -> Floats:
-    """Fraction of atoms that a Gaussian tweezer recaptures after they flew freely for a time.
+    """Fraction of atoms that a Gaussian tweezer recaptures after a time of free flight.
 
-    Atoms start from the thermal distribution of bound ones and fly straight on. An atom is recaptured if its
+    Atoms start from the thermal distribution of bound atoms and fly straight. An atom is recaptured if its
     kinetic energy is less than the depth of the trap at its new place (Tuchendler et al., Phys. Rev. A 78,
-    033425, 2008). Gravity is left out.
+    033425, 2008). Gravity is neglected.
 
     Args:
         x: Times without the trap, in s.
@@ -424,7 +424,7 @@ def _release_recapture(
         wavelength: Its wavelength in m.
         mass: Mass of an atom in atomic mass units.
     """
-    # drawing atoms takes far longer than letting them fly: it is done at fixed depths in units of kT
+    # drawing atoms takes far longer than the flight, so they are drawn at fixed depths in units of kT
     place = math.log(min(max(depth / temperature, 0.05), 1e6)) / ETA_STEP
     lower, share = math.floor(place), place % 1
     trap = (depth, waist, wavelength, mass)
@@ -436,7 +436,7 @@ def _release_recapture(
 def _recaptured(
     x: tuple[float, ...], eta: float, depth: float, waist: float, wavelength: float, mass: float
 ) -> Floats:
-    """The same at a depth in units of kT, without the amplitude."""
+    """The recaptured fraction at a given depth in units of kT, without the amplitude."""
     rayleigh = math.pi * waist**2 / wavelength
     places, velocities = _bound_atoms(eta)
     kinetic = (velocities**2).sum(axis=0) / 2  # in kT
@@ -472,7 +472,7 @@ MODELS: Final[Mapping[str, FitModel]] = {
         {"offset": 0.0},
         {"decay_fast": 0.0, "decay_slow": 0.0},
         significance={"amplitude_fast": 2.0, "amplitude_slow": 2.0},
-        advice="points that show two decays; or --fit exponential",
+        advice="points that show two decays, or --fit exponential",
     ),
     "damped_cosine": FitModel(
         "amplitude exp(-x / decay) cos(2 pi frequency x + phase) + offset",
@@ -546,7 +546,7 @@ MODELS: Final[Mapping[str, FitModel]] = {
         _guess_release,
         {"depth": math.nan, "waist": math.nan, "wavelength": math.nan, "mass": RB87_U},
         {"temperature": 1e-9, "amplitude": 0.0, "depth": 1e-9, "waist": 1e-9},
-        0.02,  # its atoms are counted: smaller steps would see their number jump
+        0.02,  # atoms are counted, and smaller steps would see their number jump
     ),
 }
-"""The models that ``--fit`` offers; offsets of exponentials and of a plateau are fixed at 0 unless freed."""
+"""The models that ``--fit`` offers. Offsets of exponentials and of a plateau are fixed at 0 unless freed."""

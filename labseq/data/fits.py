@@ -28,7 +28,7 @@ ROUNDING: Final = 1e-9
 MAX_ERROR: Final = 10.0
 """Largest error of a parameter, relative to its value or to the range of the points."""
 COMMON_FREEDOM: Final = 4.0
-"""Degrees of freedom with which the variance of all points counts in that of each."""
+"""Degrees of freedom with which the mean variance of all points enters the variance of each point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,12 +37,12 @@ class Fit:
 
     Attributes:
         model: Name of the model.
-        formula: Its function of x.
+        formula: The model's function of x as text.
         parameters: Name -> value, error and unit.
-        reduced_chi_square: nan if the points have no errors.
+        reduced_chi_square: Reduced chi-square. nan if the points have no errors.
         x: The scanned values of the points, SI, rising.
-        y: The quantity at each.
-        errors: Its standard errors.
+        y: The quantity at each point.
+        errors: Standard errors of the quantity.
     """
 
     model: str
@@ -69,10 +69,10 @@ class Fit:
         return {name: parameter for name, parameter in self.parameters.items() if parameter.error}
 
     def lines(self, of: str = "") -> list[str]:
-        """The result, a line for each parameter.
+        """The result as text, one line per parameter.
 
         Args:
-            of: What was fitted, if it must be named: " of filling".
+            of: Name of the fitted quantity if it must be given, such as " of filling".
         """
         has_errors = math.isfinite(self.reduced_chi_square)
         chi2 = f"{self.reduced_chi_square:.2f}" if has_errors else "-, the points have no errors"
@@ -84,14 +84,14 @@ class Fit:
         ]
 
     def caption(self) -> str:
-        """The result for a picture, without breaks in its numbers: model, parameters, chi-square."""
+        """The result for a picture, without line breaks in its numbers: model, parameters, chi-square."""
         values = [f"{name} {parameter}" for name, parameter in self.free.items()]
         if math.isfinite(self.reduced_chi_square):
             values.append(f"reduced chi-square {self.reduced_chi_square:.2f}")
         return f"fit {self.model}: " + ", ".join(value.replace(" ", "\xa0") for value in values)
 
     def as_json(self) -> dict[str, Any]:
-        """The result, JSON-ready, SI."""
+        """The result as JSON-ready values, SI."""
         return {
             "model": self.model,
             "parameters": {name: parameter.as_json() for name, parameter in self.parameters.items()},
@@ -114,14 +114,14 @@ def fit_points(
     Args:
         name: Name of the model.
         x: The scanned values, SI.
-        values: A mean at each; those that are nan are left out.
-        units: SI units of both; "%" for a fraction.
-        given: Parameter -> its value, with a unit if it is text, at which it is fixed; or "free".
+        values: A mean at each scanned value. Those that are nan are left out.
+        units: SI units of x and of the values. "%" for a fraction.
+        given: Parameter -> the value at which it is fixed, with a unit if it is text, or "free".
         settings: Settings of the profile's simulation.
-        lab_model: The model of a plugin, if it is none of labseq's.
+        lab_model: The model, if it comes from a plugin.
 
     Raises:
-        ConfigError: There are too few points, a parameter is missing, or the fit fails; says which.
+        ConfigError: There are too few points, a parameter is missing, or the fit fails.
     """
     model = MODELS[name] if lab_model is None else lab_model
     points, fixed = _points(x, values), _fixed(model, given or {}, settings or {})
@@ -161,7 +161,7 @@ def _points(x: Sequence[float], values: Sequence[Estimated]) -> Points:
     is_known = np.isfinite(error) & (error > ROUNDING * np.abs(y))
     if not is_known.any():
         if np.ptp(y) == 0:
-            raise _problem("the quantity is the same at all points", "one that depends on the scanned value")
+            raise _problem("the quantity is the same at all points", "a scan that changes the quantity")
         return Points(at, y, np.ones_like(y), has_errors=False, n_trials=n_trials)
     # a point without an error counts as the worst of the others
     error = np.where(is_known, error, error[is_known].max())
@@ -169,16 +169,16 @@ def _points(x: Sequence[float], values: Sequence[Estimated]) -> Points:
 
 
 def _moderated(error: Floats, n_shots: Floats) -> Floats:
-    """The errors of means over a few shots, each drawn towards that of all points.
+    """The errors of means over a few shots, each drawn towards the error of all points.
 
-    The scatter of two or five shots is a poor measure of their error: a point whose shots agree by chance
+    The scatter of two or five shots is a poor measure of their error. A point whose shots agree by chance
     would get most of the weight, and the errors of the parameters would come out up to five times too small.
-    The variance of a point is averaged with that of all points, which counts as much as five shots of its
-    own (Smyth, Stat. Appl. Genet. Mol. Biol. 3, 3, 2004).
+    The variance of a point is averaged with the variance of all points, which counts as much as five shots at
+    that point (Smyth, Stat. Appl. Genet. Mol. Biol. 3, 3, 2004).
 
     Args:
-        error: Standard errors of the points; nan for a single shot.
-        n_shots: Number of shots of each; 0 for a point that is not a mean.
+        error: Standard errors of the points. nan for a single shot.
+        n_shots: Number of shots of each. 0 for a point that is not a mean.
     """
     is_known = n_shots > 1
     if not is_known.any():
@@ -193,7 +193,7 @@ def _moderated(error: Floats, n_shots: Floats) -> Floats:
 def _solve_determined(
     model: Model, points: Points, fixed: Mapping[str, float], given: Collection[str]
 ) -> tuple[Points, Solution]:
-    """Fit, if need be without the parameters that the model can do without."""
+    """Fit all free parameters, or fix those that the model can do without if that fails."""
     try:
         return _solve(model, points, fixed)
     except ConfigError:
@@ -206,8 +206,8 @@ def _solve_determined(
 def _solve(model: Model, points: Points, fixed: Mapping[str, float]) -> tuple[Points, Solution]:
     """Fit, with rates weighted by the errors that the fit itself expects.
 
-    Where few of few atoms survive by chance, the error seems smaller than where many do, and such points
-    would pull the fit: by half an error at 20 atoms per point.
+    If by chance only few of a few atoms survive, the error seems smaller than if many do. Such points would
+    pull the fit, by half an error at 20 atoms per point.
     """
     _check_number(model, points, fixed)
     solution = model.solve(points, fixed)
@@ -233,12 +233,12 @@ def _check_number(model: Model, points: Points, fixed: Mapping[str, float]) -> N
 
 
 def parameter_unit(unit: str, x_unit: str, y_unit: str) -> str:
-    """The SI unit of a parameter, with "%" for a fraction.
+    """The SI unit of a parameter. "%" stands for a fraction.
 
     Args:
-        unit: Its unit as the model has it, see :class:`labseq.data.fit_models.FitModel`.
+        unit: Its unit in the model, see :class:`labseq.data.fit_models.FitModel`.
         x_unit: SI unit of the scanned value.
-        y_unit: SI unit of the quantity; "%" for a fraction.
+        y_unit: SI unit of the quantity. "%" for a fraction.
     """
     numerator, _, denominator = unit.partition("/")
     top = {"x": x_unit, "y": y_unit}.get(numerator, numerator)
@@ -250,14 +250,14 @@ def parameter_unit(unit: str, x_unit: str, y_unit: str) -> str:
 
 
 def _within_a_turn(parameter: Parameter) -> Parameter:
-    """A phase between -pi and pi; any other parameter as it is."""
+    """Shift a phase to between -pi and pi. Other parameters are returned as they are."""
     if parameter.text_unit != "rad":
         return parameter
     return replace(parameter, value=math.remainder(parameter.value, math.tau))
 
 
 def _check_determined(model: Model, values: Mapping[str, Estimate], points: Points) -> None:
-    """Refuse parameters with an error far larger than the range of the points, or that noise has as well."""
+    """Refuse parameters with an error far larger than the range of the points, or no larger than noise."""
     undetermined = [
         name
         for name, value in values.items()
@@ -272,7 +272,7 @@ def _check_determined(model: Model, values: Mapping[str, Estimate], points: Poin
 
 
 def _fixed(model: Model, given: Mapping[str, str | float], settings: Mapping[str, Any]) -> dict[str, float]:
-    """The parameters that are not fitted."""
+    """The parameters that are not fitted, with their values."""
     fixed = dict(model.fixed)
     keys = {"depth": "static_depth", "waist": "static_waist", "wavelength": "static_wavelength"}
     for name, key in keys.items():

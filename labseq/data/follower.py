@@ -1,4 +1,4 @@
-"""Follows a run in progress by its files, for the live view of another process, a page or an analysis."""
+"""Follows a run in progress by reading its files, for the live view, the web page or an analysis."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Event:
 
     Attributes:
         t_utc: Wall time, ISO 8601, UTC.
-        t_s: Time that the run has taken so far, in seconds, independent of the computer's clock: all parts
-            of a resumed run together, without the time between them.
-        name: What happened; one of :data:`labseq.roles.EVENTS`.
-        values: The details.
+        t_s: Time that the run has taken so far, in seconds, independent of the computer's clock. Sums all
+            parts of a resumed run, without the time between them.
+        name: What happened, one of :data:`labseq.roles.EVENTS`.
+        values: The details of the event.
     """
 
     t_utc: str
@@ -60,15 +60,15 @@ class Follower:
         return read_state(self._run_dir)[0] != "running"
 
     def now(self) -> float:
-        """Time of the run in seconds, which goes on from that of the last of :meth:`events`."""
+        """Time of the run in seconds. It continues from the time of the last of :meth:`events`."""
         return self._event_s + self._clock() - self._told_s
 
     def is_replaced(self) -> bool:
-        """Whether the index was replaced, as `labseq doctor` does: a new follower is needed."""
+        """Whether the index was replaced, as `labseq doctor` does. If so, a new follower is needed."""
         return self._index.is_replaced()
 
     def lines(self) -> Generator[tuple[int, IndexRow | None]]:
-        """The new lines of the index: where each begins in the file, and its row; None if it is damaged.
+        """The new lines of the index: start of each in the file, and its row. None if it is damaged.
 
         Raises:
             RecordingError: The index cannot be read.
@@ -89,7 +89,7 @@ class Follower:
         return Shot(self._run_dir, row, self._load)
 
     def log(self) -> Generator[Event]:
-        """The new lines of the event log, without damaged ones.
+        """The new lines of the event log. Damaged lines are left out.
 
         Raises:
             RecordingError: The log cannot be read.
@@ -107,18 +107,18 @@ class Follower:
     def events(self) -> Generator[Event]:
         """The events that the run's own observer has received since the last call.
 
-        What the log leaves out (``UNLOGGED_EVENTS`` and ``UNLOGGED_VALUES`` in ``recording/folders.py``)
-        is read from the run's other files.
+        Events and values that the log leaves out (``UNLOGGED_EVENTS`` and ``UNLOGGED_VALUES`` in
+        ``recording/folders.py``) are read from the run's other files.
 
         Raises:
             RecordingError: The run can no longer be read.
         """
         logged = list(self.log())
-        # after the log: a shot is in the index before its event is in the log
+        # after the log, because a shot is in the index before its event is in the log
         for shot in self.shots():
             self._taken[shot.index, shot.attempt, shot.status].append(shot)
         shots = [self._shot_ended_by(event) for event in logged]
-        # reading a shot's file takes 10 ms: of a run that is joined late, only the last ones are opened
+        # reading a shot's file takes 10 ms, so for a run that is joined late only the last ones are opened
         to_open = {id(shot) for shot in list(filter(None, shots))[-20:]}
         for event, shot in zip(logged, shots, strict=True):
             self._event_s, self._told_s = event.t_s, self._clock()
@@ -132,24 +132,24 @@ class Follower:
             yield replace(event, values=values)
 
     def _shot_ended_by(self, event: Event) -> Shot | None:
-        """The attempt that an event ends; None for other events and damaged lines."""
+        """The attempt that an event ends. None for other events and damaged lines."""
         if event.name not in ("shot_finished", "shot_repeated"):
             return None
         try:
             shot = event.values["shot"]
-            # an attempt that was interrupted is made again, under the same number, when the run is resumed
+            # an interrupted attempt is repeated under the same number when the run is resumed
             return self._taken[shot["shot_index"], shot["attempt"], shot["status"]].pop(0)
         except (KeyError, TypeError, IndexError):
             return None
 
 
 def _inside(shot: Shot, end: Event) -> Iterator[Event]:
-    """The stages of a shot and its last image, at the time of its end; none if its file cannot be read."""
+    """Events for the stages and the last image of a shot, at its end. None if its file cannot be read."""
     with suppress(RecordingError):
         for timing in shot.timing:
             yield replace(end, name="stage", values={"timing": timing})
         for image in shot.images[-1:]:
-            # the log has this event already; it says here whose image follows
+            # the log has this event already, but here it says whose image follows
             yield replace(end, name="shot_started", values={"shot": shot.index, "attempt": shot.attempt})
             values = {"image": image, "filling_fraction": shot.filling_fraction}
             yield replace(end, name="image", values=values)

@@ -1,4 +1,4 @@
-"""Averages over the shots of a run at one image: frames, occupancies and the detector's signals."""
+"""Averages over the shots of a run at one image: frames, occupancies and detector signals."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Floats = NDArray[np.float64]
 
 
 def average_frame(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, int]:
-    """The mean of the frames of an image, float64 (height, width) in adu, and how many there are.
+    """The mean of the frames of an image, float64 (height, width) in adu, and the number of frames.
 
     Args:
-        shots: Those without this frame, or whose frame is of another size than the first, are left out.
-        image: Index of the image in the shot; -1 for the last.
+        shots: Shots without this frame, or with another frame size than the first, are left out.
+        image: Index of the image in the shot. -1 for the last.
 
     Raises:
-        RecordingError: No shot has it: frames were not kept, or files are damaged.
+        RecordingError: No shot has the frame because frames were not kept, or files are damaged.
     """
     total, n = np.empty(0), 0
     for entry, index in _entries(shots, image):
@@ -41,11 +41,11 @@ def loading_map(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, int]:
     """The fraction of the shots with an atom on each site, float64 (n_rows, n_cols), and their number.
 
     Args:
-        shots: Those without this image are left out.
-        image: Index of the image in the shot; -1 for the last.
+        shots: Shots without this image are left out.
+        image: Index of the image in the shot. -1 for the last.
 
     Raises:
-        RecordingError: No shot has it, or files are damaged.
+        RecordingError: No shot has the image, or files are damaged.
     """
     occupancies = [entry["detection/occupancy"][index] for entry, index in _entries(shots, image)]
     if not occupancies:
@@ -57,11 +57,11 @@ def signals_of(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, Floats, s
     """The detector's signals and thresholds, each float64 (n_shots, n_rows, n_cols), and their unit.
 
     Args:
-        shots: Those without this image, or whose detector reported no signals, are left out.
-        image: Index of the image in the shot; -1 for the last.
+        shots: Shots without this image, or without signals from the detector, are left out.
+        image: Index of the image in the shot. -1 for the last.
 
     Raises:
-        RecordingError: No shot has them, or files are damaged.
+        RecordingError: No shot has signals, or files are damaged.
     """
     from labseq.recording.read_hdf5 import read_attribute  # h5py takes 0.1 s to import
 
@@ -78,7 +78,7 @@ def signals_of(shots: Sequence[Shot], image: int = 0) -> tuple[Floats, Floats, s
 
 
 def _entries(shots: Sequence[Shot], image: int) -> Generator[tuple[Any, int]]:
-    """The group ``/entry`` of each shot that has the image, and the image's index."""
+    """The group ``/entry`` of each shot that has the image, with the image's index."""
     from labseq.recording.shot_file import opened  # h5py takes 0.1 s to import
 
     for shot in shots:

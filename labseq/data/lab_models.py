@@ -1,4 +1,4 @@
-"""Models of a lab's own: lmfit models that plugins offer by name."""
+"""A lab's own fit models: lmfit models that plugins offer by name."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from labseq.text_files import is_folder
 T = TypeVar("T")
 
 MAX_WAIT_S: Final = 30.0
-"""How long a plugin may take to load, or for one fit."""
+"""How long a plugin may take to load, or to do one fit."""
 METHODS: Final = ("fit", "eval", "guess", "make_params", "param_names", "param_hints", "independent_vars")
-"""What labseq uses of an lmfit model. It imports no lmfit: the plugin does."""
+"""What labseq uses of an lmfit model. Only the plugin imports lmfit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabModel:
-    """An lmfit model of a plugin; the attributes are those of :class:`labseq.data.fit_models.FitModel`."""
+    """An lmfit model of a plugin, with the attributes of :class:`labseq.data.fit_models.FitModel`."""
 
     entry: Entry
     model: Any
@@ -48,10 +48,10 @@ class LabModel:
     def solve(
         self, points: Points, fixed: Mapping[str, float], near: Solution | None = None
     ) -> Solution | None:
-        """Fit the parameters that are not fixed; None if that does not converge.
+        """Fit the parameters that are not fixed. None if the fit does not converge.
 
         Raises:
-            ConfigError: Code of the plugin raised, did not return, or returned something else than values.
+            ConfigError: Code of the plugin raised, did not return, or returned something other than values.
         """
         return _called(self.entry, lambda: self._solve(points, fixed, near))
 
@@ -64,7 +64,7 @@ class LabModel:
             parameters[name].set(value=value)
         if unknown := [name for name in self.units if not math.isfinite(parameters[name].value)]:
             remedy = f"write model.set_param_hint('{unknown[0]}', value=...)"
-            raise self.entry.owner.fault(f"fit '{self.entry.name}' does not know where to start; {remedy}")
+            raise self.entry.owner.fault(f"fit '{self.entry.name}' lacks a starting value; {remedy}")
         self._check_values(self.model.eval(parameters, **scanned), points.x)
         weights, by_scatter = 1 / points.error, not points.has_errors
         result = self.model.fit(points.y, parameters, weights=weights, scale_covar=by_scatter, **scanned)
@@ -74,7 +74,7 @@ class LabModel:
         values = {
             name: Estimate(float(one.value), math.nan if errors[name] is None else float(errors[name]))
             for name, one in result.params.items()
-            # lmfit adds some that follow from the others, such as the width at half maximum
+            # lmfit adds parameters that follow from the others, such as the width at half maximum
             if name in self.units or errors[name]
         }
         values |= {name: Estimate(value, 0.0) for name, value in fixed.items()}
@@ -82,7 +82,7 @@ class LabModel:
         return Solution(values, float(result.redchi) if points.has_errors else math.nan, function)
 
     def _start(self, points: Points) -> Any:
-        """The parameters at their starting values: the model's guess if it has one, else its hints."""
+        """The parameters at their starting values from the model's guess, or else from its hints."""
         try:
             return self.model.guess(points.y, points.x)
         except NotImplementedError:
@@ -96,7 +96,7 @@ class LabModel:
         place = f" ({code.co_filename}:{code.co_firstlineno})" if code is not None else ""
         came = f"values of shape {array.shape} and type {array.dtype} for {len(x)} points"
         raise self.entry.owner.fault(
-            f"fit '{self.entry.name}' gives {came}; expected a number for each{place}"
+            f"fit '{self.entry.name}' returned {came}; expected one number for each{place}"
         )
 
 
@@ -105,10 +105,10 @@ def _evaluate(model: Any, parameters: Any, x: Floats) -> Floats:
 
 
 def find_lab_model(run: Run, name: str) -> LabModel:
-    """A model that an installed plugin offers, or one of the run's own folders.
+    """A model from an installed plugin or from one of the run's plugin folders.
 
     Raises:
-        ConfigError: There is none, or its plugin is at fault; says which.
+        ConfigError: There is no such model, or its plugin has an error. The message says which.
     """
     host = PluginHost(MAX_WAIT_S)
     host.load_entry_points()
@@ -125,11 +125,11 @@ def find_lab_model(run: Run, name: str) -> LabModel:
 
 
 def lab_model_of(host: PluginHost, name: str) -> LabModel:
-    """A model that one of the loaded plugins offers.
+    """A model from one of the loaded plugins.
 
     Raises:
-        UnknownPluginError: None does.
-        PluginLoadError: Its plugin is at fault.
+        UnknownPluginError: No plugin offers it.
+        PluginLoadError: The plugin has an error.
     """
     entry = host.get("fit", name)
     return call_plugin(entry.owner, f"fit '{name}'", lambda: _made(entry))
@@ -139,8 +139,8 @@ def _made(entry: Entry) -> LabModel:
     model = entry.factory()
     if missing := [name for name in METHODS if not hasattr(model, name)]:
         came = f"a {type(model).__name__}, without {missing[0]}"
-        raise entry.owner.fault(f"fit '{entry.name}' made {came}; expected an lmfit.Model")
-    # those with an expression follow from the others
+        raise entry.owner.fault(f"fit '{entry.name}' returned {came}; expected an lmfit.Model")
+    # parameters with an expression follow from the others
     names = {one for one in model.param_names if not model.param_hints.get(one, {}).get("expr")}
     parameters = [one for one in model.make_params().values() if one.name in names]
     return LabModel(
@@ -156,7 +156,7 @@ def _made(entry: Entry) -> LabModel:
 
 
 def plugin_folders_of(run: Run) -> list[Path]:
-    """The plugin folders of a run's sequence, then those of its profile, as the run has loaded them."""
+    """The plugin folders of a run's sequence, then those of its profile, as the run loaded them."""
     resolved: Mapping[str, Any] = run.record.get("resolved") or {}
     named = (("sequence_path", resolved), ("profile_path", resolved.get("profile") or {}))
     paths = [
@@ -164,12 +164,12 @@ def plugin_folders_of(run: Run) -> list[Path]:
         for path, settings in named
         for folder in settings.get("plugin_folders", ())
     ]
-    # every file that `labseq new` makes names this folder, which need not exist
+    # every file that `labseq new` writes names this folder, which need not exist
     return [path for folder, path in paths if folder != PLUGINS or is_folder(path)]
 
 
 def _called(entry: Entry, work: Callable[[], T]) -> T:
-    """Run code of a plugin; what is wrong with it is an error of the fit, with file and line."""
+    """Run code of a plugin. An error in it becomes an error of the fit, with file and line."""
     try:
         return call_plugin(entry.owner, f"fit '{entry.name}'", work)
     except PluginLoadError as error:

@@ -1,6 +1,6 @@
-"""Weighted least squares: the parameters of a function, with their errors.
+"""Weighted least squares: fits the parameters of a function and gives their errors.
 
-numpy alone, because this also runs while shots arrive and at each ``labseq show --fit``: importing
+Uses numpy alone because it also runs while shots arrive and at each ``labseq show --fit``. Importing
 scipy.optimize takes longer than everything else in that command, and lmfit three times as long.
 """
 
@@ -43,10 +43,10 @@ def minimise(
     """Find the nearest minimum of the sum of squared residuals, as Levenberg and Marquardt do.
 
     Args:
-        residuals: Parameters -> residuals in units of their errors; not finite where there are none.
+        residuals: Parameters -> residuals in units of their errors. Not finite outside the function's range.
         start: Parameters to start at.
         at_least: Their smallest values.
-        scales: Their typical sizes; 0 if unknown.
+        scales: Their typical sizes. 0 if unknown.
         relative_step: Step of the derivatives, relative to size or value, whichever is larger.
 
     Returns:
@@ -54,7 +54,7 @@ def minimise(
     """
     at = np.maximum(start, at_least)
     current, damping = residuals(at), 1e-3
-    # the least relative decrease of chi-square that is worth a step; residuals that jump hide small ones
+    # the smallest relative decrease of chi-square worth a step, because jumps of residuals hide small ones
     tolerance = max(1e-12, 0.1 * relative_step**2)
     for _ in range(MAX_STEPS if np.isfinite(current).all() else 0):
         slopes = _slopes(residuals, at, current, relative_step * np.maximum(np.abs(at), scales))
@@ -67,7 +67,7 @@ def minimise(
             predicted = current + slopes @ step
             if chi2 - predicted @ predicted <= tolerance * chi2:
                 return Minimum(at, _covariance(slopes / lengths) / np.outer(lengths, lengths), chi2)
-            # a parameter that reached its smallest value, such as a width of 0, would never leave it
+            # a parameter that reached its smallest value, such as a width of 0, would never leave it again
             trial = np.maximum(at + step, at_least + 0.1 * (at - at_least).clip(max=1e300))
             after = residuals(trial)
             if np.isfinite(after).all() and after @ after < chi2:
@@ -91,6 +91,6 @@ def _damped_step(slopes: Floats, current: Floats, damping: float) -> Floats:
 
 
 def _covariance(slopes: Floats) -> Floats:
-    """The inverse of the slopes' products; very large for a combination that changes nothing."""
+    """The inverse of the slopes' products. Very large for a combination that changes nothing."""
     _, sizes, directions = np.linalg.svd(slopes, full_matrices=False)
     return (directions.T / np.maximum(sizes, 1e-12) ** 2) @ directions

@@ -1,4 +1,4 @@
-"""Numbers that runs have measured, with error and unit; lists of runs load no more than this."""
+"""Numbers that runs have measured, with error and unit. Imports little, so that lists of runs are fast."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class Parameter:
     """A fitted parameter.
 
     Attributes:
-        value: Its value, SI; a fraction, where the text has per cent.
-        error: Its standard error; 0 if it was fixed.
-        text_unit: SI unit, in which "%" stands for a fraction: "%/s".
+        value: Its value in SI. Per cent values are stored as fractions.
+        error: Its standard error. 0 if it was fixed.
+        text_unit: SI unit for text. "%" stands for a fraction, as in "%/s".
     """
 
     value: float
@@ -25,7 +25,7 @@ class Parameter:
 
     @property
     def unit(self) -> str:
-        """Its SI unit; "" for none."""
+        """Its SI unit. "" for none."""
         return self.text_unit.replace("%/", "1/").replace("%", "")
 
     def __str__(self) -> str:
@@ -42,12 +42,12 @@ class Parameter:
         return text if self.error else f"{text} (fixed)"
 
     def as_json(self) -> dict[str, Any]:
-        """JSON-ready, SI."""
+        """The parameter as JSON-ready values, SI."""
         return {"value": self.value, "error": self.error, "unit": self.unit}
 
 
 def readable(value: float, unit: str) -> tuple[str, float]:
-    """A unit in which an SI value is readable, and its factor to SI."""
+    """A unit in which an SI value is easy to read, and its factor to SI."""
     dimension = dimension_of(unit)
     if dimension and dimension != "fraction":
         unit = readable_unit(value, dimension)
@@ -72,9 +72,9 @@ class Result:
     """A number that a run has measured.
 
     Attributes:
-        name: A fitted parameter, "decay", or a quantity, "survival:before,after".
+        name: A fitted parameter such as "decay", or a quantity such as "survival:before,after".
         value: Its value with error and unit.
-        at: The values of the other axes of the scan, as written; "" without any.
+        at: The values of the other axes of the scan, as written. "" without any.
     """
 
     name: str
@@ -82,5 +82,5 @@ class Result:
     at: str = ""
 
     def __str__(self) -> str:
-        """Name and value, as a list of runs shows them."""
+        """Name and value, as the list of runs shows them."""
         return f"{self.name} {self.value}" + (f" at {self.at}" if self.at else "")

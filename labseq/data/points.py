@@ -1,4 +1,4 @@
-"""The points of a scan, with the shots that were taken at each."""
+"""The points of a scan, each with the shots taken there."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def reporting_damage(run_dir: Path) -> Generator[None]:
     """Report errors in the body as a damaged record of a scan.
 
     Raises:
-        RecordingError: The body could not read it.
+        RecordingError: The body could not read the record.
     """
     try:
         yield
@@ -35,14 +35,14 @@ def reporting_damage(run_dir: Path) -> Generator[None]:
 
 
 class ChosenPoints:
-    """The points that an adaptive scan or a leader has chosen, each once, in the order in which they came.
+    """The different points that an adaptive scan or a leader has chosen, in the order in which they came.
 
     Args:
         scan: The scan's record in run.json.
 
     Attributes:
         points: The values of each point, SI.
-        written: The same in the units of the sequence.
+        written: The same values in the units of the sequence.
     """
 
     def __init__(self, scan: Mapping[str, Any]) -> None:
@@ -59,7 +59,7 @@ class ChosenPoints:
             parameters: Address -> value, from the shot's line of the index.
         """
         values = [parameters[address] for address in self._addresses]
-        # as text, because values may be lists, which are not keys
+        # as text, because values may be lists, which cannot be keys
         number = self._numbers.setdefault(dumps(values), len(self.points))
         if number == len(self.points):
             self.points.append(values)
@@ -68,20 +68,20 @@ class ChosenPoints:
 
 
 def _written(value: Any, unit: str) -> str:
-    """A value as a file would have it; only a leader sets others than numbers."""
+    """A value as a file would have it. Only a leader sets values other than numbers."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return written(value, unit) if is_number else value if isinstance(value, str) else dumps(value)
 
 
 def completed(scan: Mapping[str, Any], rows: Iterable[IndexRow]) -> dict[str, Any]:
-    """The record of an adaptive scan, completed with its points so that it reads like any other scan's.
+    """The record of an adaptive scan, completed with its points so that it reads like any other scan.
 
     Args:
-        rows: The lines of the index, in any order; ``point_of_shot`` is -1 for a shot without one.
+        rows: The lines of the index, in any order. ``point_of_shot`` is -1 for a shot without a line.
     """
     points = ChosenPoints(scan)
     of_shot: dict[int, int] = {}
-    # of several attempts at a shot the last one counts
+    # of several attempts at a shot, the last one counts
     for row in sorted(rows, key=lambda row: (row.shot, row.attempt)):
         of_shot[row.shot] = points.number(row.parameters)
     point_of_shot = [of_shot.get(shot, -1) for shot in range(max(of_shot, default=-1) + 1)]
@@ -89,7 +89,7 @@ def completed(scan: Mapping[str, Any], rows: Iterable[IndexRow]) -> dict[str, An
 
 
 def restricted(scan: Mapping[str, Any], shots: Collection[int]) -> dict[str, Any]:
-    """The record of a scan with the points of some shots only; the others have point -1."""
+    """The record of a scan with only the points of some shots. The other shots get point -1."""
     of_shot: Sequence[int] = scan["point_of_shot"]
     kept = sorted({of_shot[shot] for shot in shots})
     number = {point: i for i, point in enumerate(kept)}
@@ -104,12 +104,12 @@ def restricted(scan: Mapping[str, Any], shots: Collection[int]) -> dict[str, Any
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanPoint:
-    """A point of a scan and its shots.
+    """A point of a scan with its shots.
 
     Attributes:
         parameters: Scanned address -> value, SI.
-        written: The same in the units of the sequence: "60 ms".
-        shots: The shots there that count, in order.
+        written: The same values in the units of the sequence, such as "60 ms".
+        shots: The shots at this point that count, in order.
     """
 
     parameters: Mapping[str, Any]
@@ -130,7 +130,7 @@ def planned_points(scan: Mapping[str, Any]) -> list[ScanPoint]:
 
 
 def scan_points(run: Run) -> list[ScanPoint]:
-    """The points of a run's scan that have a shot, in the order of the scan; empty without one.
+    """The points of a run's scan that have a shot, in the order of the scan. Empty without a scan.
 
     Raises:
         RecordingError: The scan's record in run.json is damaged.

@@ -1,4 +1,4 @@
-"""How well a fitted parameter is to be known: an error relative to its value, or in its unit."""
+"""The error that a fitted parameter may have, relative to its value or in its unit."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from labseq.units import dimension_of, parse_any, split_quantity
 
 
 class ErrorLimit(NamedTuple):
-    """The largest error of a parameter that is good enough.
+    """The largest acceptable error of a parameter.
 
     Attributes:
-        value: SI; a fraction if it is relative to the parameter's value.
-        is_relative: Whether it is.
+        value: The error in SI. A fraction if it is relative to the parameter's value.
+        is_relative: Whether it is relative.
     """
 
     value: float
     is_relative: bool
 
     def is_met_by(self, parameter: Parameter) -> bool:
-        """Whether a parameter is known so well."""
+        """Whether a parameter's error is within this limit."""
         return parameter.error <= self.value * (abs(parameter.value) if self.is_relative else 1.0)
 
 
 def read_limit(written: float | str, unit: str) -> ErrorLimit:
-    """Read the error that a parameter is to have: per cent of its value, or a quantity of its own.
+    """Read a limit for a parameter's error, given in per cent of its value or in its unit.
 
     Args:
-        written: As the sequence has it.
+        written: The limit as the sequence has it.
         unit: SI unit of the parameter, see :func:`labseq.data.fits.parameter_unit`.
 
     Raises:
-        ValueError: It is neither, or not above 0; says why.
+        ValueError: It is neither of the two, or not above 0. The message says why.
 
     Example:
         >>> read_limit("2 %", "s"), read_limit("0.5 ms", "s")
@@ -58,5 +58,5 @@ def read_limit(written: float | str, unit: str) -> ErrorLimit:
 
 def follows(fit: Fit) -> bool:
     """Whether the points have errors and follow the model."""
-    # reduced chi-square above which points do not follow a model: errors are then too small by a factor of 2
+    # points with a larger reduced chi-square do not follow a model: errors are too small by a factor of 2
     return fit.reduced_chi_square <= 4.0

@@ -1,4 +1,4 @@
-"""The quantities of a run: every number that its shots have, by name, with its unit and its error.
+"""The quantities of a run: every number that its shots have, by name, with unit and error.
 
 Tables, plots, fits, exports, adaptive scans and checks all take their values from here.
 """
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from labseq.data.reader import Run
 
 MAX_SHOTS_READ: Final = 20
-"""Maximum number of shots in which the names of images are looked up."""
+"""Maximum number of shots in which to look up the names of images."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,12 +53,12 @@ class Quantity:
     """A number that each shot has, or a count of events in a number of trials.
 
     Attributes:
-        name: Its name: "survival:before,after", "stage.plan_s".
-        unit: Its SI unit; "" for none.
-        is_rate: Whether it counts events: shots are then added up, and the error is the Jeffreys interval;
-            otherwise it is the standard error of the mean over shots.
+        name: Its name, such as "survival:before,after" or "stage.plan_s".
+        unit: Its SI unit. "" for none.
+        is_rate: True if it counts events. Then shots are added up, and the error is the Jeffreys interval.
+            Otherwise the error is the standard error of the mean over shots.
         is_fraction: Whether it is shown in per cent.
-        events_of: A shot -> its value and 1, or its number of events and of trials; nan or 0 trials without.
+        events_of: A shot -> its value and 1, or its numbers of events and trials. nan or 0 trials without.
     """
 
     name: str
@@ -68,19 +68,19 @@ class Quantity:
     events_of: Callable[[Shot], Events]
 
     def of_shot(self, shot: Shot) -> float:
-        """The value of a shot; nan if it has none, or its file cannot be read."""
+        """The value of a shot. nan if it has none, or its file cannot be read."""
         n, n_trials = self.events(shot)
         return n / n_trials if n_trials else math.nan
 
     def over(self, shots: Iterable[Shot]) -> Estimated:
-        """The mean over those shots that have a value, with its error."""
+        """The mean over the shots that have a value, with its error."""
         events = [(n, n_trials) for n, n_trials in map(self.events, shots) if n_trials and not math.isnan(n)]
         if self.is_rate:
             return Rate(round(sum(n for n, _ in events)), round(sum(n for _, n in events)))
         return mean([n / n_trials for n, n_trials in events])
 
     def events(self, shot: Shot) -> Events:
-        """The value of a shot and 1, or its events and trials; 0 trials without a value."""
+        """The value of a shot and 1, or its events and trials. 0 trials without a value."""
         try:
             return self.events_of(shot)
         except RecordingError:
@@ -90,10 +90,10 @@ class Quantity:
 def make_quantity(
     name: str, target: TargetPattern, results: Mapping[str, Mapping[int, Any]] | None = None
 ) -> Quantity:
-    """A quantity of a name that has been checked.
+    """Make the quantity for a name that has been checked.
 
     Args:
-        name: Its name.
+        name: Name of the quantity.
         target: The target of the run.
         results: The results of analyses: name -> shot -> value.
     """
@@ -117,14 +117,14 @@ def make_quantity(
 
 
 def _in_index(name: str, row: IndexRow, target: TargetPattern) -> Events | None:
-    """A quantity of images as far as the index has it: the shot's file is then not read."""
+    """A quantity of images, if the index has it. The shot's file is then not read."""
     if name in row.measured:
         return row.measured[name]
     if name not in WITH_TARGET or target.is_none:
         return None
     if not math.isnan(row.filling_fraction):
         return (row.filling_fraction if name == "filling" else float(bool(row.success))), 1
-    # no image step has judged the shot: its last image, that of a cycle, counts
+    # no image step has judged the shot, so its last image, which belongs to a cycle, counts
     if not len(row.images):
         return None
     n_defects, n_surplus = row.images.n_defects[-1], row.images.n_surplus[-1]
@@ -140,14 +140,14 @@ def quantity_problem(
     target: TargetPattern | None,
     open_prefixes: tuple[str, ...] = (),
 ) -> tuple[str, str, str] | None:
-    """The problem with the name of a quantity, what was expected and a hint; None if it is right.
+    """The problem with the name of a quantity, what was expected, and a hint. None if it is valid.
 
     Args:
         name: The name.
         columns: The known names of quantities without images.
-        images: The known names of images; none to accept any.
-        target: The target of the run; None if it is not known.
-        open_prefixes: Prefixes of names that are not known beforehand.
+        images: The known names of images. Empty to accept any.
+        target: The target of the run. None if it is not known.
+        open_prefixes: Prefixes of names that are not known in advance.
     """
     kind, named, sites = parse_name(name)
     if kind not in OF_IMAGES:
@@ -170,7 +170,7 @@ def quantity_problem(
             return problem, f"one of {', '.join(images)}", f"did you mean '{near}'?" if near else ""
     places = [images.index(image) for image in named if image in images]
     if len(places) == 2 and places[0] >= places[1]:
-        return f"'{clean(name)}' goes from an image to one that is not later", "the earlier image first", ""
+        return f"'{clean(name)}' must name an earlier and a later image", "the earlier image first", ""
     if of_images.needs_target and target is not None and target.is_none:
         return f"there is no '{clean(name)}': the run has no target", "loading or survival, or a target", ""
     return None if target is None else _sites_problem(name, sites, target)
@@ -184,7 +184,7 @@ def _sites_problem(name: str, sites: str, target: TargetPattern) -> tuple[str, s
     except ValueError as error:
         return clean(str(error)), SITES, did_you_mean(sites, ["target", "reservoir", *target.regions])
     if parse_name(name).kind == "filling" and not target.is_none and not (mask & target.fill).any():
-        return f"no site of '{clean(name)}' is one that the target fills", SITES, ""
+        return f"the target fills no site of '{clean(name)}'", SITES, ""
     return None
 
 
@@ -209,7 +209,7 @@ def image_names(run: Run) -> list[str]:
 
 
 def column_names(run: Run) -> list[str]:
-    """The names of the quantities of a run that need no image."""
+    """The names of the quantities of a run that do not name an image."""
     names = dict.fromkeys(name for shot in run.shots[:MAX_SHOTS_READ] for name in quantities_in(shot.row))
     return [*names, *_numbers(run)]
 
@@ -224,13 +224,13 @@ def _numbers(run: Run) -> dict[str, dict[int, Any]]:
 
 
 def find_quantity(run: Run, name: str) -> Quantity:
-    """A quantity of a run.
+    """Find a quantity of a run by its name.
 
     Raises:
-        ConfigError: The run has no such quantity; lists those that it has.
+        ConfigError: The run has no such quantity. The message lists the quantities that it has.
     """
     if name in measured_by(run) and not name.startswith(RESULT_PREFIX):
-        return quantity_of(run, name)  # was checked before the run; reading names of images takes a while
+        return quantity_of(run, name)  # already checked before the run; reading image names takes a while
     images = image_names(run) if parse_name(name).images else []
     problem = quantity_problem(name, column_names(run), images, run.target)
     if problem is not None:
@@ -246,7 +246,7 @@ ANALYSE: Final = "results, which 'labseq analyse' computes where they are missin
 
 
 def why_no_results(run: Run, name: str) -> str:
-    """Why no shot has a result of an analysis that the run's sequence lists; "" for other quantities."""
+    """Why an analysis that the run's sequence lists has no results at all. "" for other quantities."""
     analysis, _ = split_result(name) or ("", "")
     listed = [one.get("use") for one in (run.record.get("resolved") or {}).get("analysis") or ()]
     if analysis not in listed:
@@ -259,11 +259,11 @@ def why_no_results(run: Run, name: str) -> str:
 
 
 WITH_TARGET: Final = ("filling", "defect_free")
-"""What a run with a target measures if its sequence does not say it."""
+"""What a run with a target measures if its sequence does not list quantities."""
 
 
 def measures_of(run: Run) -> Sequence[Mapping[str, Any]]:
-    """What a run measures, as its sequence says it: "value", and as given "fit", "report", "parameters"."""
+    """The entries of ``measure`` in a run's sequence: "value" and maybe "fit", "report", "parameters"."""
     return (run.record.get("resolved") or {}).get("measure") or ()
 
 
@@ -273,14 +273,14 @@ def measured_by(run: Run) -> tuple[str, ...]:
 
 
 def names_measured(resolved: Mapping[str, Any], target: TargetPattern) -> tuple[str, ...]:
-    """The same, from the settings and the target of a run."""
+    """Names of the quantities measured, from the settings and the target of a run."""
     if names := measured_in(resolved):
         return names
     steps: list[StepSummary] = []
     for step in resolved.get("shot", ()):  # of an earlier version: kind -> settings, with a name
         kind = next((key for key in step if key not in ("name", "policy")), "")
         steps.append(StepSummary(step.get("name") or kind, kind == "image", kind == "load"))
-    # shots without images have that at least
+    # even shots without images have a duration
     return measured_by_default(steps, has_target=not target.is_none) or ("duration_s",)
 
 
@@ -297,7 +297,7 @@ def steps_that_load(run: Run) -> frozenset[int]:
 
 
 def _check_no_load(run: Run, name: str) -> None:
-    """Refuse survival between images with a loading between them, as far as the run's record tells."""
+    """Refuse survival between images if atoms are loaded between them, as far as the run's record tells."""
     kind, images, _ = parse_name(name)
     loads = steps_that_load(run)
     if kind != "survival" or not loads or not run.shots:

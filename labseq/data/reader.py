@@ -1,4 +1,4 @@
-"""Reads a recorded run."""
+"""Reads a recorded run from disk."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 def open_run(path: str | Path) -> Run:
     """Open a recorded run, which may be finished, still running or killed.
 
-    Only the index is read. A shot's file is read when one of its values is needed.
+    Opening reads only the index. A shot's file is read when one of its values is needed.
 
     Args:
-        path: The run's folder or any file in it, or its name or number as ``labseq runs`` prints it:
-            "2026-11-20/0001_compact-225", "compact-225" or "75", of which it is the newest.
+        path: The run's folder or any file in it, or its name or number as ``labseq runs`` prints it, such as
+            "2026-11-20/0001_compact-225", "compact-225" or "75". The newest run with that name is opened.
 
     Raises:
         RecordingError: There is no such run, or it is damaged, or has another format.
@@ -55,11 +55,11 @@ def open_run(path: str | Path) -> Run:
         ) from None
     folder = folders.find_run(path)
     record = read_run(folder)
-    # the state before the index: if the run is complete by now, the index has all of its lines
+    # the state before the index, so that a run which is complete by now has all lines in the index
     status, error = read_state(folder)
     rows, n_damaged = read_index(folder)
     load = CachingLoader()
-    # of a shot that was written twice, the last line counts
+    # the last line of a shot that was written twice counts
     counted = {row.shot: row for row in rows if row.counts}
     return Run(
         path=folder,
@@ -88,11 +88,11 @@ class Run:
     Attributes:
         path: The run's folder.
         record: The content of run.json: settings, devices, versions, ...
-        status: "running", "complete", "stopped" or "failed"; a run whose process died has failed.
+        status: "running", "complete", "stopped" or "failed". A run whose process died has failed.
         error: The error that ended it, or "".
         shots: The shots that count, in order.
         attempts: Attempts at shots that failed or were interrupted, in the order they were made.
-        n_damaged_lines: Lines of the index that cannot be read; 0 unless the file was damaged.
+        n_damaged_lines: Lines of the index that cannot be read. 0 unless the file was damaged.
         skipped: Shots that were skipped: index -> reason.
     """
 
@@ -108,7 +108,7 @@ class Run:
     def __repr__(self) -> str:
         return f"<Run {self.path}: {len(self.shots)} of {self.n_shots} shots, {self.status}>"
 
-    # what a method needs is imported in it: a run that is being taken is opened, too, and needs none of it
+    # methods import what they need: a run that is being taken is opened, too, and needs none of it
 
     @property
     def name(self) -> str:
@@ -137,12 +137,12 @@ class Run:
 
     @property
     def units(self) -> Mapping[str, str]:
-        """SI units of what was set and scanned: address -> unit; without those that have none."""
+        """SI units of settings and scanned values: address -> unit. Addresses without a unit are left out."""
         return dict(self.record.get("units") or {})
 
     @property
     def reading_units(self) -> Mapping[str, str]:
-        """Units of the readings whose devices name them: "laser.power" -> "W"."""
+        """Units that devices give for their readings: "laser.power" -> "W"."""
         devices: Mapping[str, Any] = self.record.get("devices") or {}
         units = {name: about.get("units") for name, about in devices.items() if isinstance(about, dict)}
         return {
@@ -160,26 +160,26 @@ class Run:
 
     @property
     def note(self) -> str:
-        """The note about the run, of the page or ``labseq note``; read from its file each time."""
+        """The note about the run from the web page or ``labseq note``. Read from its file each time."""
         from labseq.recording.notes import read_notes
 
         return read_notes(self.path).comment
 
     @property
     def tags(self) -> tuple[str, ...]:
-        """The tags of the run; read from their file each time."""
+        """The tags of the run. Read from their file each time."""
         from labseq.recording.notes import read_notes
 
         return read_notes(self.path).tags
 
     @property
     def scan(self) -> Mapping[str, Any]:
-        """The scan: addresses, points and the point of each shot; empty without one.
+        """The scan: addresses, points and the point of each shot. Empty without a scan.
 
-        For an adaptive scan, the points are those chosen so far; they are computed at each call.
+        For an adaptive scan, these are the points chosen so far, computed at each call.
 
         Raises:
-            RecordingError: Its record in run.json or the index is damaged.
+            RecordingError: The scan's record in run.json or the index is damaged.
         """
         scan: Mapping[str, Any] = self.record.get("scan") or {}
         if WRITTEN_UNITS not in scan:
@@ -191,19 +191,19 @@ class Run:
 
     @property
     def ended_early(self) -> str:
-        """Why it is complete before its last shot, as ``stop_when`` of its sequence asked; or ""."""
+        """Why the run ended before its last shot, because ``stop_when`` was met. "" if it did not."""
         return str(read_state_file(self.path).get("ended_early") or "")
 
     @property
     def defect_free(self) -> float:
-        """Fraction of the shots that met the target, of those that were judged; nan without any."""
+        """Fraction of the judged shots that met the target. nan if none was judged."""
         from labseq.model.estimate import mean
 
         return mean([shot.success for shot in self.shots if not math.isnan(shot.filling_fraction)]).value
 
     @property
     def filling_fraction(self) -> float:
-        """Mean filling of the target over the shots that have one; nan without any."""
+        """Mean filling of the target over the shots that have one. nan if none has."""
         from labseq.model.estimate import mean
 
         return mean([f for shot in self.shots if not math.isnan(f := shot.filling_fraction)]).value
@@ -212,8 +212,8 @@ class Run:
     def events(self) -> tuple[dict[str, Any], ...]:
         """The event log, read from the file each time: dicts with ``t_utc``, ``t_s``, ``event``, ``values``.
 
-        ``t_s`` is the time since the process began or resumed the run, in seconds; setting the computer's
-        clock does not change it.
+        ``t_s`` is the time in seconds since the process began or resumed the run. It does not change if the
+        computer's clock is set.
 
         Raises:
             RecordingError: The file cannot be read.
@@ -223,7 +223,7 @@ class Run:
     def analysis(self, name: str) -> list[dict[str, Any]]:
         """The results of an analysis: a row per shot, with its index as "shot" and the results.
 
-        A row with "error" contains the reason why the shot has no result.
+        A row with "error" gives the reason why the shot has no result.
 
         Raises:
             RecordingError: There are no results of that name, or they cannot be read.
@@ -236,11 +236,11 @@ class Run:
         """A quantity of the run's shots, by name.
 
         Args:
-            name: "survival:before,after", "filling:before", the name of a numerical column of
-                :meth:`to_dataframe`, or "analysis.NAME.KEY".
+            name: "survival:before,after", "filling:before", a numerical column of :meth:`to_dataframe`, or
+                "analysis.NAME.KEY".
 
         Raises:
-            ConfigError: The run has no such quantity; lists those that it has.
+            ConfigError: The run has no such quantity. The message lists the quantities that it has.
 
         Example:
             ``run.quantity("survival:before,after").over(run.shots)`` is its mean, with the error.
@@ -250,11 +250,11 @@ class Run:
         return find_quantity(self, name)
 
     def select(self, *conditions: str) -> Run:
-        """The run with only those shots that count and meet all conditions.
+        """The run with only the shots that count and meet all conditions.
 
         Args:
-            conditions: Comparisons of a quantity or a column of :meth:`to_dataframe` with a value:
-                "filling:before == 1", "shot.hold.duration > 5 ms".
+            conditions: Comparisons of a quantity or a column of :meth:`to_dataframe` with a value, such as
+                "filling:before == 1" or "shot.hold.duration > 5 ms".
 
         Raises:
             ConfigError: A condition cannot be read, or no shot meets all of them.
@@ -289,16 +289,16 @@ class Run:
 
         Args:
             quantity: Its name, see :meth:`quantity`.
-            model: Name of the model, as of ``labseq show --fit``.
-            where: Conditions on the shots, see :meth:`select`. In a scan of several values they choose one
-                value of each of the others; :meth:`fits` fits at all of them.
-            fixed: Parameter -> the value at which it is fixed: a number in SI, or text with a unit.
-            free: Parameters to fit that the model fixes otherwise.
-            along: Scanned address to fit along; by default the first.
+            model: Name of the model, as for ``labseq show --fit``.
+            where: Conditions on the shots, see :meth:`select`. In a scan of several values they must select
+                one value of each other axis. :meth:`fits` fits at all of them.
+            fixed: Parameter -> the value at which it is fixed, a number in SI or text with a unit.
+            free: Parameters to fit that the model would otherwise fix.
+            along: Scanned address to fit along. Default: the first.
 
         Returns:
-            ``parameters`` (name -> ``value``, ``error``, which is 0 if it was fixed, and ``unit``, SI),
-            ``reduced_chi_square``, ``at(x)``, ``residuals``, and the points: ``x``, ``y``, ``errors``.
+            A fit with ``parameters`` (name -> ``value``, ``error`` and ``unit``, SI, error 0 if fixed),
+            ``reduced_chi_square``, ``at(x)``, ``residuals``, and the points ``x``, ``y``, ``errors``.
 
         Raises:
             ConfigError: There is no such quantity or model, or the points do not determine the parameters.
@@ -310,7 +310,7 @@ class Run:
         if len(fits) > 1:
             others = " and ".join(fits[0].values)
             problem = f"there are {len(fits)} values of {others} to fit at"
-            expected = "one, chosen by 'where'; or fits()"
+            expected = "one value, chosen by 'where', or fits()"
             raise ConfigError(Problem(problem, clean(self.path.name), expected=expected))
         assert fits[0].fit is not None  # otherwise it has raised
         return fits[0].fit
@@ -325,13 +325,13 @@ class Run:
         free: Sequence[str] = (),
         along: str | None = None,
     ) -> list[FitAt]:
-        """Fit a quantity along one axis of a scan, at each combination of the values of the others.
+        """Fit a quantity along one axis of a scan, at each combination of values of the other axes.
 
-        Arguments and errors are those of :meth:`fit`.
+        Arguments and errors are the same as for :meth:`fit`.
 
         Returns:
-            For each combination its ``values`` by address, and the ``fit``; where it failed, None and the
-            ``problem``.
+            For each combination its ``values`` by address and the ``fit``. If the fit failed, it is None
+            and ``problem`` says why.
         """
         from labseq.data.scanned import FitRequest, Scanned, fits_along, scanned
 
@@ -342,7 +342,7 @@ class Run:
         return fits_along(run, scan, found, scan.over(found), FitRequest(model, given, along))
 
     def summary(self) -> dict[str, Any]:
-        """The main results of the run, JSON-ready; None for a missing number."""
+        """The main results of the run as JSON-ready values. None for a missing number."""
         return {
             "run_dir": str(self.path),
             "shots": len(self.shots),
@@ -353,13 +353,13 @@ class Run:
         }
 
     def to_dataframe(self, *, attempts: bool = False) -> pd.DataFrame:
-        """The shots as a table of pandas: a row for each, from the index alone.
+        """The shots as a pandas table with one row per shot, read from the index alone.
 
-        The columns: ``attempt``, ``status``, times, ``success``, ``filling_fraction``, counts of cycles,
-        batches, atom moves and defects, ``duration_s``; scanned and set values, by address; ``stage.*``,
-        how long each stage took; ``reading.*``, values read from devices; ``calibration.*``, ids. Numbers
-        are SI, and nan where they are missing. ``attrs`` has ``units`` and ``descriptions`` by column,
-        and the values that hold for the whole run.
+        The columns are ``attempt``, ``status``, times, ``success``, ``filling_fraction``, counts of cycles,
+        batches, atom moves and defects, and ``duration_s``. Scanned and set values follow by address, then
+        ``stage.*``, how long each stage took, ``reading.*``, values read from devices, and ``calibration.*``,
+        ids. Numbers are SI, and nan where they are missing. ``attrs`` has ``units`` and ``descriptions`` by
+        column, and the values that hold for the whole run.
 
         Args:
             attempts: Whether to include failed and interrupted attempts.
@@ -372,19 +372,19 @@ class Run:
         return dataframe_of(self, attempts=attempts)
 
     def to_xarray(self, *, occupancies: bool = True) -> xr.Dataset:
-        """The shots that count as a dataset of xarray.
+        """The shots that count as an xarray dataset.
 
-        Its axes are those of the scan and ``repeat``; ``point`` and ``repeat`` where the scan is no
-        product of its addresses; ``shot`` without a scan. Variables are the columns of
-        :meth:`to_dataframe`, with nan for shots that are missing; and ``occupancy``, int8
-        (..., image, row, col), -1 where there is no such image, which is read from the shots' files.
+        Its axes are the axes of the scan and ``repeat``, or ``point`` and ``repeat`` if the scan is not a
+        product of its addresses, or ``shot`` without a scan. Variables are the columns of
+        :meth:`to_dataframe`, with nan for missing shots, and ``occupancy``, int8 (..., image, row, col).
+        The occupancies are read from the shots' files and are -1 where there is no such image.
 
         Args:
             occupancies: Whether to read the occupancies.
 
         Raises:
             ConfigError: xarray is not installed.
-            RecordingError: A shot's file is missing or damaged, or the scan is.
+            RecordingError: A shot's file is missing or damaged, or the scan is damaged.
         """
         from labseq.data.tables import dataset_of
 

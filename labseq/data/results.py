@@ -1,4 +1,4 @@
-"""The numbers that a run was taken for: the parameters that its sequence asks for, or means of quantities."""
+"""The main results of a run: fitted parameters that its sequence asks for, or means of quantities."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from labseq.model.estimate import Estimated, Rate
 
 
 def results_of(run: Run) -> list[Result]:
-    """The results of a run, the most important first; none without shots.
+    """The results of a run, the most important first. Empty without shots.
 
-    Of each quantity that the run measures these are the parameters of its fits; without a fit that has
-    succeeded, the mean over all shots. Of an adaptive scan, the best mean comes first.
+    For each quantity that the run measures, these are the parameters of its fits, or the mean over all
+    shots if no fit succeeded. For an adaptive scan, the best mean comes first.
 
     Raises:
         RecordingError: The run is damaged.
@@ -40,7 +40,7 @@ def results_of(run: Run) -> list[Result]:
 
 
 def own_fits(run: Run, scan: Scanned, quantity: Quantity, means: Sequence[Estimated]) -> list[FitAt]:
-    """The fits of a quantity that the run's sequence asks for; a fit that fails is a problem in them."""
+    """The fits of a quantity that the run's sequence asks for. A fit that fails has a ``problem``."""
     wanted = next((one for one in measures_of(run) if one["value"] == quantity.name and "fit" in one), None)
     if wanted is None or not scan.axes:
         return []
@@ -52,7 +52,7 @@ def own_fits(run: Run, scan: Scanned, quantity: Quantity, means: Sequence[Estima
 
 
 def reported(run: Run, quantity: Quantity, at: FitAt) -> Result | None:
-    """The parameter of a fit that the run's sequence asks for, else its first; None if the fit has none."""
+    """The parameter of a fit that the run's sequence reports, or else the first. None if there is none."""
     name = next((one.get("report") for one in measures_of(run) if one["value"] == quantity.name), None)
     if at.fit is None or not (name := name or _first_free(at.fit)) or name not in at.fit.parameters:
         return None
@@ -64,8 +64,8 @@ def _first_free(fit: Fit) -> str:
 
 
 def as_parameter(quantity: Quantity, mean: Estimated) -> Parameter:
-    """The mean of a quantity, as fitted parameters are given; the error of a rate is half its interval."""
+    """The mean of a quantity in the form of a fitted parameter. The error of a rate is half its interval."""
     low, high = mean.interval
     error = (high - low) / 2 if isinstance(mean, Rate) else mean.error
-    # an error of 0 would say that the value was fixed
+    # an error of 0 would mean that the value was fixed
     return Parameter(mean.value, error or math.nan, "%" if quantity.is_fraction else quantity.unit)

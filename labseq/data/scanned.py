@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A scanned address and its values.
+    """One axis of a scan: a scanned address and its values.
 
     Attributes:
-        address: The address, and those that change together with it.
+        address: The address, and any addresses that change together with it.
         labels: Its different values as written, in the order of the scan.
-        numbers: The same as numbers, and the unit of these; None if they are not numbers of one dimension.
+        numbers: The same values as numbers, with their unit. None unless all are numbers of one dimension.
     """
 
     address: str
@@ -39,7 +39,7 @@ class Axis:
     numbers: tuple[tuple[float, ...], str] | None
 
     def value(self, number: int) -> float | str:
-        """One of its values, SI; as written if it is not a number."""
+        """The value with this index, SI, or as written if it is not a number."""
         if self.numbers is None:
             return self.labels[number]
         return scaled(self.numbers[0][number], factor_of(self.numbers[1]))
@@ -47,7 +47,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scanned:
-    """The points of a scan.
+    """The points of a scan on its axes.
 
     Attributes:
         axes: Independent addresses, the slowest first.
@@ -61,7 +61,7 @@ class Scanned:
 
     @property
     def is_map(self) -> bool:
-        """Whether there are two axes or more, and most combinations of their values have a point."""
+        """True for two or more axes if at least half the combinations of their values have a point."""
         n_cells = math.prod(len(axis.labels) for axis in self.axes)
         return len(self.axes) > 1 and len({*self.places}) >= n_cells / 2
 
@@ -70,7 +70,7 @@ class Scanned:
         return [quantity.over(point.shots) for point in self.points]
 
     def on_axis(self, number: int) -> tuple[list[float], str] | None:
-        """Each point's value on an axis, and the unit that it is written in; None if they are not numbers."""
+        """Each point's value on an axis and its unit as written. None if the values are not numbers."""
         numbers = self.axes[number].numbers
         if numbers is None:
             return None
@@ -78,7 +78,7 @@ class Scanned:
 
 
 def scanned(run: Run) -> Scanned | None:
-    """The points of a run's scan that have shots; None without a scan.
+    """The points of a run's scan that have shots. None without a scan.
 
     Raises:
         RecordingError: The scan in run.json is damaged.
@@ -87,7 +87,7 @@ def scanned(run: Run) -> Scanned | None:
 
 
 def on_axes(scan: Mapping[str, Any], points: Sequence[ScanPoint]) -> Scanned | None:
-    """Points of a scan on its axes; None without any.
+    """Arrange points of a scan on its axes. None without any points.
 
     Args:
         scan: The scan's record in run.json.
@@ -99,7 +99,7 @@ def on_axes(scan: Mapping[str, Any], points: Sequence[ScanPoint]) -> Scanned | N
     columns, values = list(zip(*rows, strict=True)), list(zip(*scan["points"], strict=True))
     numbers = [_numbers(*pair) for pair in zip(values, columns, strict=True)]
     addresses = list(map(clean, points[0].written))
-    # an axis at least, even if all points have the same value
+    # at least one axis, even if all points have the same value
     varied = [i for i, column in enumerate(columns) if len({*column}) > 1] or [0]
     together: dict[int, list[str]] = {}
     # addresses that change together share an axis
@@ -115,7 +115,7 @@ def on_axes(scan: Mapping[str, Any], points: Sequence[ScanPoint]) -> Scanned | N
 
 
 def make_axis(address: str, labels: Sequence[str], values: Sequence[Any]) -> Axis:
-    """An axis from the labels and values, SI, of its points, of which some may be equal."""
+    """An axis from the labels and the SI values of its points. Some points may be equal."""
     value_of_label = dict(zip(labels, values, strict=True))
     return Axis(address, tuple(value_of_label), _numbers([*value_of_label.values()], [*value_of_label]))
 
@@ -125,7 +125,7 @@ def _follows(
 ) -> bool:
     """Whether the values of address i change together with those of address k, and not by chance.
 
-    No two points of an optimiser share a value; numbers must then rise or fall together.
+    No two points of an optimiser share a value, so there numbers must rise or fall together.
     """
     leader, own_numbers, leader_numbers = columns[k], numbers[i], numbers[k]
     if len({*zip(columns[i], leader, strict=True)}) > len({*leader}):
@@ -137,7 +137,7 @@ def _follows(
 
 
 def _numbers(values: Sequence[Any], written: Sequence[str]) -> tuple[tuple[float, ...], str] | None:
-    """Values as numbers in the unit of the largest, and that unit; None unless they have one dimension."""
+    """Values as numbers in the unit of the largest, and that unit. None unless they have one dimension."""
     if not all(type(value) in (int, float) for value in values):
         return None
     units = [split_quantity(text)[1] for text in written]
@@ -151,12 +151,12 @@ def _numbers(values: Sequence[Any], written: Sequence[str]) -> tuple[tuple[float
 
 
 def is_geometric(values: Sequence[float]) -> bool:
-    """Whether rising values have nearly equal ratios over a wide range, or most are crowded at its beginning.
+    """Whether rising values need a logarithmic axis, with nearly even ratios or crowded at the low end.
 
     Example:
         >>> is_geometric([1, 2, 5, 10, 20]), is_geometric([1, 10, 20, 30, 40])
         (True, False)
-        >>> is_geometric([10, 15, 20, 30, 45, 100, 300, 1000, 3000])  # on a linear axis most would be at 0
+        >>> is_geometric([10, 15, 20, 30, 45, 100, 300, 1000, 3000])  # most would be at 0 on a linear axis
         True
     """
     if len(values) < 3 or values[0] <= 0 or values[-1] < 20 * values[0]:
@@ -168,13 +168,13 @@ def is_geometric(values: Sequence[float]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class FitRequest:
-    """A fit along an axis of a scan.
+    """What to fit along an axis of a scan.
 
     Attributes:
         model: Name of the model.
-        given: Parameter -> its value, with a unit if it is text, at which it is fixed; or "free".
-        along: Scanned address to fit along; None for the first axis.
-        lab_model: The model, if a plugin offers it that is loaded already.
+        given: Parameter -> the value at which it is fixed, with a unit if it is text, or "free".
+        along: Scanned address to fit along. None for the first axis.
+        lab_model: The model, if it comes from a plugin that is already loaded.
     """
 
     model: str
@@ -184,7 +184,7 @@ class FitRequest:
 
 
 def request_of(measure: Mapping[str, Any], lab_model: LabModel | None = None) -> FitRequest:
-    """The fit of an entry of ``measure`` that has one, see :func:`labseq.data.quantities.measures_of`."""
+    """The fit for an entry of ``measure`` that has one, see :func:`labseq.data.quantities.measures_of`."""
     return FitRequest(measure["fit"], measure.get("parameters") or {}, lab_model=lab_model)
 
 
@@ -193,11 +193,11 @@ class FitAt:
     """The fit at one combination of the values of the other axes.
 
     Attributes:
-        values: Address of each other axis -> its value there, SI if it is a number.
-        written: The same in the units of the sequence.
-        fit: The fit; None if it failed.
+        values: Address of each other axis -> its value, SI if it is a number.
+        written: The same values in the units of the sequence.
+        fit: The fit. None if it failed.
         problem: Why it failed, or "".
-        points: Indices of its points among those of the scan.
+        points: Indices of the fitted points among the points of the scan.
     """
 
     values: Mapping[str, Any]
@@ -207,7 +207,7 @@ class FitAt:
     points: tuple[int, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """JSON-ready, SI."""
+        """The result as JSON-ready values, SI."""
         result = {"error": self.problem} if self.fit is None else self.fit.as_json()
         return {"at": dict(self.values), **result}
 
@@ -215,7 +215,7 @@ class FitAt:
 def fits_along(
     run: Run, scan: Scanned, quantity: Quantity, means: Sequence[Estimated], request: FitRequest
 ) -> list[FitAt]:
-    """Fit a quantity along one axis, at each combination of the values of the others.
+    """Fit a quantity along one axis, at each combination of values of the other axes.
 
     Args:
         run: The run.
@@ -225,7 +225,7 @@ def fits_along(
         request: What to fit.
 
     Raises:
-        ConfigError: There is no such axis, or no fit can be made.
+        ConfigError: There is no such axis, or every fit failed.
     """
     i_along = _axis_number(scan, request.along)
     groups: dict[tuple[int, ...], list[int]] = {}
@@ -255,9 +255,9 @@ def fits_along(
 def fitter(
     run: Run, quantity: Quantity, unit: str, request: FitRequest
 ) -> Callable[[Sequence[float], Sequence[Estimated]], Fit]:
-    """What fits points of a quantity: takes the scanned values, in ``unit``, and the mean at each.
+    """Make a function that fits a quantity to points: scanned values in ``unit`` and the mean at each.
 
-    It raises as :func:`labseq.data.fits.fit_points` does.
+    The function raises the same errors as :func:`labseq.data.fits.fit_points`.
 
     Raises:
         ConfigError: There is no such model.

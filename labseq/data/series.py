@@ -1,4 +1,4 @@
-"""A quantity of every line of a run's index, which grows while the run writes it."""
+"""The values of a quantity for every line of a run's index, which grows during the run."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from labseq.recording.index import IndexRow
 from labseq.recording.results import Results, results_file
 
 Lines = Sequence[int] | NDArray[np.int64]
-"""Lines of an index, counted from 0, without damaged ones."""
+"""Numbers of lines of an index, counted from 0, without damaged lines."""
 
 
 class Series:
     """The values of a quantity in the lines of a run's index.
 
-    What the index does not have is waited for: results of analyses come later than their shots, and the
-    files of shots, which take 10 to 20 ms each, are read by :meth:`read_files` alone.
+    Values that the index lacks are added later. Results of analyses come after their shots. Files of shots
+    take 10 to 20 ms each to read, so only :meth:`read_files` reads them.
 
     Args:
         quantity: The quantity.
@@ -65,10 +65,10 @@ class Series:
         self._n_trials.append(n_trials)
 
     def read_results(self) -> None:
-        """Add the results of analyses that have come.
+        """Add the results of analyses that have arrived.
 
         Raises:
-            RecordingError: They cannot be read.
+            RecordingError: The results cannot be read.
         """
         if self._results is None or not self._waiting:
             return
@@ -80,7 +80,7 @@ class Series:
                 self._set(line, *((float(value), 1.0) if is_number else NO_VALUE))
 
     def read_files(self, shot_of: Callable[[int], Shot], seconds: float) -> None:
-        """Add what the files of shots have.
+        """Add values from the files of shots.
 
         Args:
             shot_of: Line -> its shot.
@@ -121,7 +121,7 @@ class Series:
         return self.over([range(len(self))])[0]
 
     def value(self, line: int) -> float:
-        """The value of a line; nan if it is unknown."""
+        """The value of a line. nan if it is unknown."""
         return self._n[line] / self._n_trials[line] if self._n_trials[line] else math.nan
 
     def n_known(self, lines: Lines) -> int:

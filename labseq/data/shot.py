@@ -1,4 +1,4 @@
-"""Reads a recorded shot."""
+"""Reads a recorded shot from the index and its file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def load_content(path: Path) -> ShotContent:
 
 
 class CachingLoader:
-    """Reads shots' files and keeps the last eight: several values of a shot then read its file once."""
+    """Reads shots' files and keeps the last eight, so that several values of a shot read its file once."""
 
     def __init__(self) -> None:
         self._read = lru_cache(maxsize=8)(load_content)
@@ -43,9 +43,9 @@ class CachingLoader:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Shot:
-    """A recorded shot. Values in the index are read at once, all others from the shot's file when needed.
+    """A recorded shot. Values in the index are known at once, all others are read from its file when needed.
 
-    Every property from ``occupancies`` on raises ``RecordingError`` if the file is missing or damaged.
+    Every property from ``occupancies`` onwards raises ``RecordingError`` if the file is missing or damaged.
 
     Attributes:
         run_dir: The run's folder.
@@ -76,7 +76,7 @@ class Shot:
 
     @property
     def status(self) -> ShotStatus:
-        """One of "complete", "interrupted" and "failed"."""
+        """The status: "complete", "interrupted" or "failed"."""
         return self.row.status
 
     @property
@@ -86,12 +86,12 @@ class Shot:
 
     @property
     def filling_fraction(self) -> float:
-        """Filling of the target on the last ``image`` step; nan without one."""
+        """Filling of the target on the last ``image`` step. nan without such a step."""
         return self.row.filling_fraction
 
     @property
     def seen_defect_free_cycle(self) -> int:
-        """Index of the first cycle whose image met the target; -1 if none."""
+        """Index of the first cycle whose image met the target. -1 if none did."""
         return self.row.seen_defect_free_cycle
 
     @property
@@ -99,24 +99,24 @@ class Shot:
         """The detected occupancies, bool (n_images, n_rows, n_cols)."""
         from labseq.recording.shot_file import read_occupancies
 
-        # a seventh of the time that the whole file takes
+        # takes a seventh of the time to read the whole file
         return read_occupancies(self.file)[1].astype(np.bool_)
 
     @property
     def signals(self) -> NDArray[np.float64]:
-        """The detector's signals, float64 (n_images, n_rows, n_cols); nan where it reported none."""
+        """The detector's signals, float64 (n_images, n_rows, n_cols). nan where it reported none."""
         none = np.full(self._content.target.shape, np.nan)
         signals = [none if image.signal is None else image.signal for image in self.images]
         return np.array(signals, np.float64).reshape(len(signals), *none.shape)
 
     @property
     def thresholds(self) -> NDArray[np.float64] | None:
-        """The thresholds of the signals, float64 (n_rows, n_cols); None if the detector reported none."""
+        """The thresholds of the signals, float64 (n_rows, n_cols). None if the detector reported none."""
         return self._content.record.thresholds
 
     @property
     def sites_px(self) -> NDArray[np.float64] | None:
-        """(y, x) of each site on the frames, float64 (n_rows, n_cols, 2); None if it was not reported."""
+        """(y, x) of each site on the frames, float64 (n_rows, n_cols, 2). None if it was not reported."""
         return self._content.record.sites_px
 
     @property
@@ -152,7 +152,7 @@ class Shot:
 
     @property
     def edges(self) -> tuple[LineEdge, ...]:
-        """The changes of the lines, as the timing box played them; empty without a timing box."""
+        """The changes of the digital lines as the timing box played them. Empty without a timing box."""
         return tuple(self._content.record.edges)
 
     @property
@@ -162,7 +162,7 @@ class Shot:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Settings of this shot that differ from the files: address -> value; scanned ones in SI."""
+        """Settings of this shot that differ from the files: address -> value, scanned values in SI."""
         return dict(self.row.parameters)
 
     @property
@@ -177,7 +177,7 @@ class Shot:
 
     @property
     def atom_events(self) -> dict[str, NDArray[Any]]:
-        """Events of the atoms in the simulation: name -> structured array; empty on real hardware."""
+        """Events of the atoms in the simulation: name -> structured array. Empty on real hardware."""
         return dict(self._content.record.atom_events)
 
     @property
@@ -195,10 +195,10 @@ class Shot:
 
     @property
     def frames(self) -> NDArray[np.uint16]:
-        """The recorded frames, uint16 (n_frames, height, width); read from the file each time.
+        """The recorded frames, uint16 (n_frames, height, width). Read from the file each time.
 
         Raises:
-            RecordingError: The frames differ in size; :meth:`record` gives them one by one.
+            RecordingError: The frames differ in size. :meth:`record` gives them one by one.
         """
         from labseq.recording.shot_file import read_frames
 
@@ -208,7 +208,7 @@ class Shot:
         return np.stack(images) if images else np.empty((0, 0, 0), np.uint16)
 
     def record(self) -> ShotRecord:
-        """The whole record as it was written, frames included."""
+        """The whole record as it was written, including frames."""
         from labseq.recording.shot_file import read_frames, with_frames
 
         return with_frames(self._content.record, read_frames(self.file))
@@ -217,7 +217,7 @@ class Shot:
         """Compare the file with the checksum in the index.
 
         Raises:
-            RecordingError: A byte has changed since it was written.
+            RecordingError: The file cannot be read, or has changed since it was written.
         """
         try:
             sha256 = digest_of(self.file).sha256

@@ -1,4 +1,4 @@
-"""Maps of the sites: a quantity of the images at each site, over the shots of a run."""
+"""Maps of the sites: a quantity of images at each site, over the shots of a run."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from labseq.model.image_quantities import OF_IMAGES, at_sites, parse_name
 Floats = NDArray[np.float64]
 
 MIN_TRIALS: Final = 5
-"""Number of atoms, or shots, below which a site has no value."""
+"""Number of trials (atoms or shots) below which a site has no value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteMap:
-    """A quantity at each site; every array has the shape (n_rows, n_cols).
+    """A quantity at each site. Every array has the shape (n_rows, n_cols).
 
     Attributes:
         name: Name of the quantity.
-        n: int64, how often it happened: the atom survived, the site was filled.
-        n_trials: int64, how often it could: there was an atom before, there was a shot.
+        n: int64, number of events, such as atoms that survived or shots in which the site was filled.
+        n_trials: int64, number of trials, such as atoms before or shots.
         n_shots: Number of shots that were read.
     """
 
@@ -41,24 +41,24 @@ class SiteMap:
 
     @property
     def mean(self) -> float:
-        """The share at all sites together; nan without trials."""
+        """The share of events in all trials at all sites. nan without trials."""
         return float(self.n.sum() / n_trials) if (n_trials := self.n_trials.sum()) else math.nan
 
     @property
     def values(self) -> Floats:
-        """float64, the share at each site; nan where it is known from fewer than 5 trials."""
+        """float64, the share of events at each site. nan where there are fewer than 5 trials."""
         return np.where(self.n_trials >= MIN_TRIALS, self.n / np.maximum(self.n_trials, 1), np.nan)
 
     @property
     def errors(self) -> Floats:
-        """float64, its standard error, half an event of either kind added; nan as in ``values``."""
+        """float64, standard error of ``values``, with half an event of either kind added. nan as there."""
         share = (self.n + 0.5) / (self.n_trials + 1)
         errors = np.sqrt(share * (1 - share) / np.maximum(self.n_trials, 1))
         return np.where(self.n_trials >= MIN_TRIALS, errors, np.nan)
 
     @property
     def deviations(self) -> Floats:
-        """float64, the difference to the mean of all sites in standard errors of that mean at the site."""
+        """float64, difference from the mean of all sites, in standard errors of that mean at the site."""
         n, n_trials = int(self.n.sum()), int(self.n_trials.sum())
         mean = (n + 0.5) / (n_trials + 1)
         errors = np.sqrt(mean * (1 - mean) / np.maximum(self.n_trials, 1))
@@ -66,19 +66,19 @@ class SiteMap:
 
 
 def site_map(run: Run, name: str, shots: Sequence[Shot] | None = None) -> SiteMap:
-    """A quantity at each site.
+    """Map a quantity of images over the sites.
 
     Args:
         run: The run.
-        name: "survival:before,after", "loading", "filling:before@corner": a quantity of images.
-        shots: Some of its shots; by default all. Each one's file is read; damaged ones are left out.
+        name: A quantity of images: "survival:before,after", "loading", "filling:before@corner".
+        shots: Some of its shots. Default: all. Every shot's file is read, and damaged ones are left out.
 
     Raises:
-        ConfigError: The run has no such quantity, or it is not one of sites.
+        ConfigError: The run has no such quantity, or it has no value for a site.
     """
     find_quantity(run, name)  # raises for a name that the run does not have
     if parse_name(name).kind not in OF_IMAGES:
-        problem = f"'{clean(name)}' has one value in each shot, and none for a site"
+        problem = f"'{clean(name)}' has one value per shot, not one per site"
         raise ConfigError(Problem(problem, clean(run.path.name), expected=f"one of {', '.join(OF_IMAGES)}"))
     n, n_trials = np.zeros(run.target.shape, np.int64), np.zeros(run.target.shape, np.int64)
     n_shots = 0

@@ -1,4 +1,4 @@
-"""Converts the shots of a run to a pandas table or an xarray dataset; needs the extra ``analysis``."""
+"""Converts the shots of a run to a pandas table or an xarray dataset. Needs the extra ``analysis``."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def check_installed(*packages: str) -> None:
     """Raise if packages of the extra ``analysis`` are missing.
 
     Raises:
-        ConfigError: One is missing; says how to install it.
+        ConfigError: A package is missing. The message says how to install it.
     """
     for package in packages:
         if find_spec(package) is None:
@@ -81,7 +81,7 @@ def dataset_of(run: Run, *, occupancies: bool = True) -> xr.Dataset:
         for column in columns_of(run)
     }
     if occupancies:
-        meaning = f"1 where the detector saw an atom, 0 where not, {NO_IMAGE} where there is no such image"
+        meaning = f"1 where the detector saw an atom, 0 where it saw none, {NO_IMAGE} where there is no image"
         attributes = {"units": "", "description": meaning}
         names, stack = _occupancies(run)
         data["occupancy"] = ((axis, "image", "row", "col"), stack, attributes)
@@ -94,11 +94,11 @@ def dataset_of(run: Run, *, occupancies: bool = True) -> xr.Dataset:
 
 
 def _occupancies(run: Run) -> tuple[list[str], NDArray[np.int8]]:
-    """The names of all images, in the order of a shot, and the occupancies at each."""
+    """The names of all images in the order of a shot, and the occupancies on each."""
     from labseq.recording.shot_file import read_occupancies
 
     shots = [read_occupancies(shot.file) for shot in run.shots]
-    # a shot may end after fewer cycles than another: all images of all shots, by step and cycle
+    # shots may have different numbers of cycles, so this collects all images of all shots, by step and cycle
     all_images = dict.fromkeys(image for images, _ in shots for image in images)
     names = [name for *_, name in sorted(all_images, key=itemgetter(0, 1))]
     stack = np.full((len(shots), len(names), *run.target.shape), NO_IMAGE, np.int8)
@@ -109,12 +109,12 @@ def _occupancies(run: Run) -> tuple[list[str], NDArray[np.int8]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Grid:
-    """The axes of a scan.
+    """The axes of a scan as a grid.
 
     Attributes:
-        dims: The scanned addresses and "repeat"; or "point" and "repeat" where the scan is not a product
-            of its addresses.
-        shape: Length of each.
+        dims: The scanned addresses and "repeat", or "point" and "repeat" if the scan is not a product of
+            its addresses.
+        shape: Length of each axis.
         places: Indices of each shot along the axes.
         coords: Scanned address -> its axis, and its values there.
     """
@@ -126,7 +126,7 @@ class _Grid:
 
 
 def _on_grid(shots: xr.Dataset, grid: _Grid) -> xr.Dataset:
-    """Spread the axis "place" over those of a scan; nan or "" where there is no shot."""
+    """Spread the axis "place" over the axes of a scan. nan or "" where there is no shot."""
     import pandas as pd
     import xarray as xr
 
@@ -135,7 +135,7 @@ def _on_grid(shots: xr.Dataset, grid: _Grid) -> xr.Dataset:
     if len(grid.places) < math.prod(grid.shape):  # nan needs a float
         counts = [str(name) for name in columns if name != "occupancy" and columns[name].dtype.kind in "bi"]
         columns = columns.assign({name: columns[name].astype(np.float64) for name in counts})
-    # integers and booleans have no places without a shot: either they are floats now, or no place is empty
+    # integers and booleans need no fill value: either they are floats now, or there is a shot at every place
     missing_of_kind: Mapping[str, Any] = {"O": "", "f": np.nan, "i": 0, "b": False}
     missing = {name: missing_of_kind[columns[name].dtype.kind] for name in columns}
     missing |= {"occupancy": NO_IMAGE} if "occupancy" in columns else {}
@@ -150,7 +150,7 @@ def _on_grid(shots: xr.Dataset, grid: _Grid) -> xr.Dataset:
 
 
 def _grid_of(run: Run) -> _Grid | None:
-    """The axes of a run's scan; None without one.
+    """The axes of a run's scan. None without a scan.
 
     Raises:
         RecordingError: The scan's record in run.json is damaged.
@@ -171,7 +171,7 @@ def _grid(addresses: list[str], points: list[list[Any]], point_of_shot: list[int
         counts[point] += 1
     axes = [dict(zip(map(dumps, values), values, strict=True)) for values in zip(*points, strict=True)]
     keys = [tuple(map(dumps, point)) for point in points]
-    # a list of points that holds each combination once is a grid, too
+    # a list of points that contains each combination once is a grid, too
     is_product = math.prod(map(len, axes)) == len(points) == len(set(keys))
     if is_product:
         dims, shape = tuple(addresses), tuple(map(len, axes))

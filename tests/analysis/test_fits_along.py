@@ -166,15 +166,15 @@ def test_a_plugin_s_lmfit_model_is_fitted_by_its_name(lifetime: labseq.Run, plug
     [
         (
             "own_start",
-            "plugin 'own_fits': fit 'own_start' does not know where to start; write model.set_param_h",
+            "plugin 'own_fits': fit 'own_start' lacks a starting value; write model.set_param_h",
         ),
         (
             "own_wrong",
-            r"fit 'own_wrong' gives values of shape \(3,\) .* expected a number .*own_fits.py:15\)",
+            r"fit 'own_wrong' returned values of shape \(3,\) .* expected one number .*own_fits.py:15\)",
         ),
         ("own_raise", r"fit 'own_raise' raised TypeError: .*own_fits.py:20\)"),
         ("own_hang", "fit 'own_hang' did not return within 2 s and was abandoned"),
-        ("own_none", "fit 'own_none' made a int, without fit; expected an lmfit.Model"),
+        ("own_none", "fit 'own_none' returned a int, without fit; expected an lmfit.Model"),
     ],
 )
 def test_a_plugin_s_model_that_is_wrong_is_named_in_one_line(

@@ -106,7 +106,7 @@ def test_shots_are_selected_by_any_quantity(lifetime: labseq.Run) -> None:
         select_shots(lifetime, ["status < 3"])
     with pytest.raises(ConfigError, match="no shot meets loading:before > 2"):
         lifetime.select("loading:before > 2")
-    with pytest.raises(ConfigError, match="this is not a condition: 'before full'"):
+    with pytest.raises(ConfigError, match="'before full' is not a condition"):
         select_shots(lifetime, ["before full"])
     with pytest.raises(ConfigError, match=r"'30 Hz' does not have the unit of 'shot\.hold\.dur"):
         select_shots(lifetime, ["shot.hold.duration > 30 Hz"])
@@ -219,7 +219,7 @@ def test_maps_of_sites_add_up_to_the_quantity(lifetime: labseq.Run, tmp_path: Pa
     picture = map_picture(lifetime, [name, "loading"])
     picture.save(tmp_path / "map.png")
     assert [len(row) for row in picture.rows] == [2, 2]
-    with pytest.raises(ConfigError, match="'n_atoms' has one value in each shot, and none for a site"):
+    with pytest.raises(ConfigError, match="'n_atoms' has one value per shot, not one per site"):
         site_map(lifetime, "n_atoms")
 
 

@@ -218,7 +218,7 @@ def test_an_oscillation_that_does_not_decay_is_fitted_without_a_decay() -> None:
     ("model", "p", "printed"),
     [
         ("damped_cosine", 0.5, "amplitude cannot be told from noise; expected points over more of the"),
-        ("double_exponential", np.exp(-EVEN / 30e-6), "expected points that show two decays; or --fit expon"),
+        ("double_exponential", np.exp(-EVEN / 30e-6), "expected points that show two decays, or --fit expon"),
         (
             "exponential",
             1.0,

@@ -95,7 +95,7 @@ def test_some_sites_are_measured(tmp_path: Path) -> None:
         ("measure: []", "5:10: "),
         ("measure: loadin", "5:10: there is no quantity 'loadin' to measure"),
         ("measure: [loading, survival, loading]", "5:30: 'loading' is listed a second time"),
-        ("measure: ['survival:before,before']", "goes from an image to one that is not later to measure"),
+        ("measure: ['survival:before,before']", "must name an earlier and a later image to measure"),
         ("measure: ['survival:after,before']", "expected the earlier image first"),
         ("measure: [filling]", "5:11: there is no 'filling': the run has no target to measure"),
         ("measure: [{value: loading, fit: gausian}]", "5:33: there is no model 'gausian'"),
