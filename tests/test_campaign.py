@@ -314,7 +314,7 @@ def test_a_folder_without_a_campaign_and_what_a_campaign_cannot_be(
     assert message in refusal(capsys, "export", folder)
     (tmp_path / "campaign.yaml").write_text(FILE, encoding="utf-8")
     assert "cannot be exported as 'csv'; expected netcdf" in refusal(capsys, "export", folder, "--to", "csv")
-    assert "these options are for one of its runs" in refusal(capsys, "plot", folder, "--shot", "1")
+    assert "these options are for a single run" in refusal(capsys, "plot", folder, "--shot", "1")
     assert "the campaign has no runs yet" in refusal(capsys, "plot", folder)
 
 

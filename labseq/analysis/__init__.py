@@ -1,1 +1,1 @@
-"""Evaluates recorded runs: statistics, plots, replay."""
+"""Evaluates recorded runs: statistics, plots and replay."""

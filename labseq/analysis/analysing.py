@@ -29,13 +29,13 @@ def analyse_run(
     *,
     again: bool,
 ) -> int:
-    """Analyse the shots of a run that have no result yet, and print how many; then the scan.
+    """Analyse the shots of a run that have no result yet, print how many, and then print the scan.
 
     Args:
-        path: The run's folder; the newest if it is None.
-        use: One analysis, or None for all that the sequence names.
-        overrides: "key=value" for its settings.
-        request: What to print of the scan.
+        path: The run's folder. None for the newest run.
+        use: Name of one analysis, or None for all that the sequence lists.
+        overrides: "key=value" for the settings of this analysis.
+        request: What to print of the scan. None to print no scan.
         where: Conditions on the shots that are printed.
         again: Whether to analyse all shots again.
 
@@ -62,7 +62,7 @@ def _analyses_to_run(
         settings = next((analysis for analysis in analyses if analysis[USE] == use), {USE: use})
         return [{**settings, **_changes(overrides)}]
     if overrides:
-        problem, hint = "it does not say which analysis has this setting", "name it with --use"
+        problem, hint = "the analysis with this setting is not given", "name it with --use"
         raise ConfigError(Problem(problem, clean(f"--set {overrides[0]}"), hint=hint))
     if not analyses and not may_be_none:
         problem, hint = "the run's sequence has no analysis", "name one with --use"
@@ -71,7 +71,7 @@ def _analyses_to_run(
 
 
 def _changes(overrides: Sequence[str]) -> dict[str, Any]:
-    """The values of ``--set``."""
+    """The values of ``--set`` as settings."""
     for_sequence, for_profile = split_overrides(overrides)
     if for_profile:
         problem = "an analysis has no settings in the profile"
@@ -80,7 +80,7 @@ def _changes(overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def _report(outcome: AnalysisOutcome) -> None:
-    before = f", {outcome.n_before} had a result already" if outcome.n_before else ""
+    before = f", {outcome.n_before} already had a result" if outcome.n_before else ""
     say(f"{outcome.name}: {plural(outcome.n_done, 'shot')} analysed{before}; see {outcome.path}")
     failures = [f"{outcome.name}: shot {shot} failed: {text}" for shot, text in outcome.failures.items()]
     say(*first_of(failures, "more shots failed"), stream=sys.stderr)

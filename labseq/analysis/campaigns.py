@@ -1,4 +1,4 @@
-"""The runs of a campaign together: one file, one picture, and what each point measures."""
+"""The runs of a campaign together: one file, one picture, and the results at each point."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 Runs = Mapping[Point, Sequence[Run]]
 
 OF_SHOTS: Final = ("filling_fraction", "success", "n_defects", "n_batches", "n_atom_moves")
-"""Columns of the shots that the combined file has for each shot."""
+"""Columns of the shots that the combined file contains for each shot."""
 
 
 def campaign_in(path: Path | None) -> Path | None:
-    """The folder of the campaign that a command is given; None for a run.
+    """The folder of a campaign if a command is given one. None if it is given a run.
 
     Raises:
-        ConfigError: This folder is neither.
+        ConfigError: This folder is neither a run nor a campaign.
     """
     folder = None if path is None else path.expanduser()
     if folder is None or not folder.is_dir():
@@ -70,7 +70,7 @@ def export_campaign(folder: Path, path: Path) -> None:
 
 
 def _missing(campaign: Campaign, runs: Runs) -> list[str]:
-    """A line about the points whose runs are not complete; none if all are."""
+    """A line about the points whose runs are not complete. Empty if all are complete."""
     n_complete = sum(
         len(same_point) == campaign.settings.runs and all(run.status == "complete" for run in same_point)
         for same_point in runs.values()
@@ -85,9 +85,9 @@ def combined(campaign: Campaign, runs: Runs) -> xr.Dataset:
     """The results of a campaign on the grid of its points.
 
     Returns:
-        With a dimension for each axis: ``n_shots``, and the mean of what the runs measure with the ends
-        of their 1 sigma intervals, ``filling_low`` and ``filling_high``. With the dimension ``repeat`` as
-        well, if points have several shots: :data:`OF_SHOTS`. nan without a value. Coordinates are SI.
+        A dataset with a dimension for each axis. It has ``n_shots``, and the mean of each quantity that the
+        runs measure with the ends of its 1 sigma interval, such as ``filling_low`` and ``filling_high``. If
+        points have several shots, :data:`OF_SHOTS` have the dimension ``repeat`` as well. Coordinates are SI.
     """
     check_installed("xarray", "h5netcdf")
     import numpy as np
@@ -137,23 +137,23 @@ def _description(name: str) -> str:
 
 
 def _values(campaign: Campaign, address: str, runs: Runs) -> list[Any]:
-    """The values of an axis, SI; all as written if one of them is not a number."""
+    """The values of an axis in SI, or all as written if one of them is not a number."""
     written, axis = campaign.axes[address], [*campaign.axes].index(address)
     values: list[Any] = [*written]
     for i, text in enumerate(written):
         with suppress(ValueError):
             values[i] = parse_any(text)[0]
-    for point, same_point in runs.items():  # as the run read it, which knows the setting's type
+    for point, same_point in runs.items():  # as the run read it, because it knows the setting's type
         for run in same_point:
             values[point[axis]] = run.record["overrides"][address]["value"]
     return values if all(type(value) in (int, float) for value in values) else [*written]
 
 
 def campaign_picture(folder: Path) -> RunPicture:
-    """Filling and defect-free fraction at the points of a campaign: points with errors, or maps for two axes.
+    """What a campaign measures at its points: points with errors, or maps for two axes.
 
     Raises:
-        ConfigError: It has no shots yet.
+        ConfigError: The campaign has no shots yet.
         RecordingError: A run is damaged.
     """
     campaign, runs = recorded_runs(folder)
@@ -180,7 +180,7 @@ def campaign_picture(folder: Path) -> RunPicture:
 
 
 def results_of(runs: Sequence[Run]) -> dict[str, str]:
-    """What some runs of one sequence measure: name -> mean over their shots, as text; empty without runs."""
+    """Results of some runs of one sequence: quantity -> mean over their shots as text. Empty without runs."""
     quantities = [_over_runs({(): runs}, name) for name in measured_by(runs[0])] if runs else []
     shots = _shots(runs)
     return {title_of(one): value_text(one.over(shots), one, short=True) for one in quantities}

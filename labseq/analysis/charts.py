@@ -37,21 +37,21 @@ Panel = Callable[["Axes"], None]
 """A function that draws on axes."""
 
 MAX_POINTS: Final = 200
-"""Maximum number of points of the line of a running mean."""
+"""Maximum number of points on the line of a running mean."""
 MIN_SHARE: Final = 1e-3
-"""Numbers of defects that are less probable than this are not drawn unless they occurred."""
+"""Numbers of defects less probable than this are not drawn unless they occurred."""
 MAX_BARS: Final = 40
 """Maximum number of bars in the histogram of defects."""
 N_BINS: Final = 80
 """Number of bars in the histogram of signals."""
 COLOURS: Final = "cividis"
-"""Colour map of fractions: its lightness rises evenly, for every kind of colour vision and in print."""
+"""Colour map of fractions. Its lightness rises evenly, for all kinds of colour vision and in print."""
 DIVERGING: Final = "RdBu"
 """Colour map of deviations: red below, white at 0, blue above."""
 NO_VALUE: Final = "0.94"
 """Grey of a cell without a value."""
 MANY_BARS: Final = 15
-"""Above this number of bars, the line has no marks, and empty bars have no errors."""
+"""Above this number of bars, the line has no markers, and empty bars have no error bars."""
 MIN_RANGE_PERCENT: Final = 1.0
 MAX_TICKS: Final = 10
 
@@ -83,10 +83,10 @@ STYLE: Final[dict[Any, Any]] = {
 
 
 def points_of(x: Sequence[float], values: Sequence[Estimated]) -> Floats:
-    """Means with the ends of their 1 sigma intervals; unknown means are left out.
+    """Means with the ends of their 1 sigma intervals. Unknown means are left out.
 
     Args:
-        x: The x value of each.
+        x: The x value of each mean.
         values: Means with standard errors, or rates with Jeffreys intervals.
 
     Returns:
@@ -103,15 +103,15 @@ def points_of(x: Sequence[float], values: Sequence[Estimated]) -> Floats:
 def trend(
     name: str, shots: Floats, values: Floats, *, is_yes_or_no: bool, unit: str = "%", scale: float = 100.0
 ) -> Panel | None:
-    """A quantity of each shot, and its running mean with the error; None if no shot has a value.
+    """A panel with a quantity of each shot and its running mean with error. None if no shot has a value.
 
     Args:
-        name: The quantity.
+        name: Name of the quantity.
         shots: float64 (n,), indices of the shots.
-        values: float64 (n,), a value for each, SI; nan if unknown.
-        is_yes_or_no: Whether each value is 0 or 1; the scale is then 0 to 100 %.
-        unit: Unit that the values are shown in.
-        scale: Factor to it.
+        values: float64 (n,), a value for each shot, SI. nan if unknown.
+        is_yes_or_no: True if each value is 0 or 1. The axis then goes from 0 to 100 %.
+        unit: Unit in which the values are shown.
+        scale: Factor from SI to this unit.
     """
     has_value = np.isfinite(values)
     if not has_value.any():
@@ -137,7 +137,7 @@ def trend(
         )
         axes.plot(x, scale * y, color=DARK, linewidth=1.4, marker="o" if len(x) == 1 else "", zorder=4)
         averaged = "1 shot" if window == 1 else f"{window} shots"
-        title, label = f"{name} by shot; line: mean of {averaged}", f"{name} ({unit})" if unit else name
+        title, label = f"{name} by shot, line: mean of {averaged}", f"{name} ({unit})" if unit else name
         axes.set(title=title, xlabel="shot", ylabel=label)
         axes.set_xlim(shots[0] - 0.5, shots[-1] + 0.5)
         # -4 and 104 leave room for the marks at 0 and 100 %
@@ -149,7 +149,7 @@ def trend(
 
 
 def running_mean(shots: Floats, values: Floats, *, is_yes_or_no: bool) -> tuple[int, Floats]:
-    """The number of shots in a running mean, and the mean, see :func:`points_of`."""
+    """The number of shots in a running mean, and the mean as :func:`points_of` returns it."""
     window = min(len(values), max(10, len(values) // 10))
     starts = np.unique(np.linspace(0, len(values) - window, MAX_POINTS).astype(np.int64))
     parts = [values[start : start + window].tolist() for start in starts]
@@ -171,11 +171,11 @@ def draw_curves(
     scale: float = 100.0,
     line: Callable[[Floats], Floats] | None = None,
 ) -> None:
-    """Draw values with error bars, by default fractions in per cent.
+    """Draw values with error bars. Default: fractions in per cent.
 
     Args:
-        curves: Name -> points, see :func:`points_of`; at least one of each.
-        ticks: Text at x = 0, 1, 2, ... instead of numbers; the points are then not joined.
+        curves: Name -> points, see :func:`points_of`, at least one point each.
+        ticks: Text at x = 0, 1, 2, ... instead of numbers. The points are then not joined.
         scale: Factor on the values.
         line: A function of x that is drawn through the points instead of joining them.
     """
@@ -221,10 +221,10 @@ def draw_map(
     label: str,
     limits: tuple[float, float],
 ) -> None:
-    """Draw values against two scanned values, a cell for each pair.
+    """Draw values against two scanned values, with a cell for each pair.
 
     Args:
-        values: float64 (len(y_ticks), len(x_ticks)), in the unit of the label; NaN if unknown.
+        values: float64 (len(y_ticks), len(x_ticks)), in the unit of the label. NaN if unknown.
     """
     from matplotlib import colormaps
 
@@ -261,12 +261,12 @@ def draw_sites(
     outlined: NDArray[np.bool_],
     limit: float = 0.0,
 ) -> None:
-    """Draw a fraction for each site, in its cell.
+    """Draw a fraction for each site in its cell.
 
     Args:
-        values: float64 (n_rows, n_cols), fractions; NaN if unknown.
+        values: float64 (n_rows, n_cols), fractions. NaN if unknown.
         outlined: bool (n_rows, n_cols), the target, around which a line is drawn.
-        limit: For deviations instead of fractions: drawn from minus this to this.
+        limit: For deviations instead of fractions. The colours then span -limit to limit.
     """
     from matplotlib import colormaps
     from matplotlib.collections import LineCollection, PolyCollection
@@ -298,13 +298,13 @@ def draw_sites(
 
 
 def defects(counts: Sequence[int], n_sites: int, n_all: int, end: str) -> Panel | None:
-    """The share of the shots with each number of defects, and that of independent sites; None without any.
+    """The share of shots with each number of defects, next to independent sites. None without any shots.
 
     Args:
         counts: Number of shots with 0, 1, 2, ... defects.
-        n_sites: Sites of the target.
-        n_all: Number of shots, those without a number of defects included.
-        end: When they were counted: "on the last image".
+        n_sites: Number of sites of the target.
+        n_all: Number of shots, including shots without a number of defects.
+        end: When the defects were counted, such as "on the last image".
     """
     n_shots = sum(counts)
     if not n_shots or not n_sites:
@@ -338,7 +338,7 @@ def defects(counts: Sequence[int], n_sites: int, n_all: int, end: str) -> Panel 
         title = f"{average} defects in a shot, {n_shots} of {n_all} shots"
         axes.set(title=title, xlabel=f"defects {end}{bar_note}", ylabel="shots (%)")
         least = x[0] - 0.6 * width
-        # at least five bars wide, as a single one would fill the picture
+        # at least five bars wide, because a single bar would fill the picture
         axes.set_xlim(least, max(least + 5.2, x[-1] + 0.6 * width, at[-1] + 0.6 * width))
         axes.set_ylim(0.0, 135 * float(max(np.nanmax(high), expected.max())))  # with room for the legend
         whole_numbers(axes.xaxis)
@@ -364,7 +364,7 @@ def binomial(n: int, p: float, n_least: int) -> Floats:
 
 
 def loss_causes(losses: Mapping[str, Estimate]) -> Panel | None:
-    """A bar for the atoms lost to each cause in a simulation, the worst first; None if nothing was lost."""
+    """Bars for the atoms lost to each cause in a simulation, most first. None if nothing was lost."""
     sorted_losses = sorted(losses.items(), key=lambda item: -item[1].value)
     rows = [
         (cause.replace("_", " "), loss.value, loss.error) for cause, loss in sorted_losses if loss.value > 0
@@ -391,13 +391,13 @@ def loss_causes(losses: Mapping[str, Estimate]) -> Panel | None:
 
 
 def stages_of_a_shot(title: str, stages: Sequence[StageStatistics], clocks: Mapping[str, str]) -> Panel:
-    """The times of a shot's stages below one another, on a logarithmic scale.
+    """The times of a shot's stages, one below the other, on a logarithmic scale.
 
-    A point shows the median, a line reaches to the 99th percentile, a mark shows the budget.
+    A point shows the median, a line reaches to the 99th percentile, and a mark shows the budget.
 
     Args:
-        title: Title.
-        stages: The stages; at least one.
+        title: Title of the panel.
+        stages: The stages, at least one.
         clocks: "session_s" and perhaps "host_s" -> name of the clock.
     """
 
@@ -472,13 +472,13 @@ def signals_of_sites(shots: Sequence[Shot]) -> Panel:
         low, middle, high = np.quantile(thresholds, (0.0, 0.5, 1.0))
         label = f"threshold {middle:.4g}"
         if high > low:
-            label = f"median {label}; thresholds of the sites from {low:.4g} to {high:.4g}"
+            label = f"median {label}, thresholds of the sites from {low:.4g} to {high:.4g}"
             axes.axvspan(low, high, color=RED, alpha=0.15, linewidth=0)
         axes.axvline(middle, color=RED, linewidth=1.2, label=label)
         total = f"{signals.size} signals on the first image of {len(signals)} shots"
         title = f"{total}, {int((signals > thresholds).sum())} above threshold"
         axes.set(title=title, xlabel=f"signal of a site ({unit})" if unit else "signal of a site")
-        # logarithmic, as the tails of the peaks decide about errors
+        # logarithmic, because the tails of the peaks determine the errors
         axes.set(ylabel="sites", yscale="log")
         axes.yaxis.set_major_formatter("{x:g}")
         axes.legend()
@@ -498,7 +498,7 @@ def _time_text(time_s: float, _: object) -> str:
 
 
 def _with_room(values: Floats, room: float, min_range: float) -> tuple[float, float]:
-    """Limits of an axis, with a margin above and below that is relative to the range."""
+    """Limits of an axis, with margins above and below relative to the range."""
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     room *= max(high - low, min_range) or abs(high) or 1.0
     return low - room, high + room
@@ -515,9 +515,9 @@ def set_labels(axis: Axis, labels: Sequence[str], room: int = 32, most: int = 24
     """Label the ticks at 0, 1, 2, ...
 
     Args:
-        labels: Their texts.
-        room: They are turned if they have more characters than this altogether.
-        most: Maximum number of labels; if there are more, some are left out.
+        labels: Texts of the labels.
+        room: Labels with more characters than this in total are rotated.
+        most: Maximum number of labels. If there are more, some are left out.
     """
     turned = len(labels) * max(map(len, labels)) > room
     at = range(0, len(labels), -(-len(labels) // most))

@@ -76,7 +76,7 @@ def compare(
     ],
     scan: Annotated[
         str | None,
-        typer.Option(metavar="QUANTITY", help="The quantity; default: what the first run measures."),
+        typer.Option(metavar="QUANTITY", help="The quantity. Default: what the first run measures."),
     ] = None,
     output: PictureFile = None,
     as_json: Json = False,
@@ -96,7 +96,7 @@ def trend(
         str,
         typer.Argument(
             metavar="NAME",
-            help="A fitted parameter, a quantity or a changed setting: decay, survival:before,after.",
+            help="A fitted parameter, quantity or changed setting, such as decay or survival:before,after.",
             show_default=False,
         ),
     ],
@@ -112,7 +112,7 @@ def trend(
     as_json: Json = False,
     _plugins: Plugins = None,
 ) -> None:
-    """Follow a number over the runs of a data folder; say and mark where a calibration has changed."""
+    """Follow a number over the runs of a data folder, and mark where a calibration has changed."""
     from labseq.analysis.comparison import show_trend
 
     conditions = {"since": since, "until": until, "sequence": sequence, "tag": tag, "status": status}
@@ -124,7 +124,7 @@ def replay(
     planner: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="Another planner; its settings are the defaults except for --dop and --set."
+            metavar="NAME", help="Another planner, with default settings except for --dop and --set."
         ),
     ] = None,
     dop: Annotated[
@@ -132,16 +132,14 @@ def replay(
     ] = None,
     detector: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME", help="Another detector; its settings are the defaults except for --set."
-        ),
+        typer.Option(metavar="NAME", help="Another detector, with default settings except for --set."),
     ] = None,
     overrides: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="ADDRESS=VALUE",
-            help="Change planner.KEY or profile.detector.KEY; may be given several times.",
+            help="Change planner.KEY or profile.detector.KEY. May be given several times.",
         ),
     ] = None,
     shots: Annotated[
@@ -159,8 +157,8 @@ def replay(
 ) -> None:
     """Pass a run's images to another planner or detector, and compare the results with the recorded ones.
 
-    Without another planner or detector, the run's own must reproduce what was recorded; the exit code is
-    1 if they do not.
+    Without another planner or detector, the run's own must reproduce the recorded results. The exit code
+    is 1 if they do not.
     """
     from labseq.analysis.replay import ReplayRequest
     from labseq.analysis.replay_report import replay_run
@@ -180,7 +178,7 @@ def analyse(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Change a setting of the analysis given by --use; may be given several times.",
+            help="Change a setting of the analysis given by --use. May be given several times.",
         ),
     ] = None,
     again: Annotated[
@@ -193,7 +191,7 @@ def analyse(
     along: Along = None,
     _plugins: Plugins = None,
 ) -> None:
-    """Analyse the shots of a run that have no result yet; with --scan, then print it.
+    """Analyse the shots of a run that have no result yet. With --scan, then print the scan.
 
     If the settings differ from those of the existing results, all shots are analysed again.
     """
@@ -210,7 +208,7 @@ def plot(
         str | None,
         typer.Option(
             metavar="PART",
-            help="The average image, the loading of each site or the counts (image, loading, counts); "
+            help="The average image, the loading of each site or the counts (image, loading, counts), "
             "or one part of the overview: filling, success, survival, defects, timing, scan or losses.",
         ),
     ] = None,
@@ -234,9 +232,9 @@ def plot(
             "--output",
             "-o",
             metavar="FILE",
-            help="A PNG, SVG or PDF file; with --shot also a GIF or a page (.html) of the motion in a "
+            help="A PNG, SVG or PDF file. With --shot, also a GIF or a page (.html) of the motion in a "
             "cycle. Default: overview.png, shot-3.png, ... in the current folder, with a number if "
-            "there is such a file.",
+            "the file exists.",
         ),
     ] = None,
     scan: ScanQuantities = None,
@@ -246,7 +244,7 @@ def plot(
             "--map",
             metavar="[QUANTITY]",
             help="A quantity of the images at each site: survival:before,after, loading, filling or "
-            "defect_free; default: what the run measures. May be given several times.",
+            "defect_free. Default: what the run measures. May be given several times.",
         ),
     ] = None,
     where: Where = None,
@@ -258,7 +256,7 @@ def plot(
 ) -> None:
     """Draw a run, finished or not: an overview, one part of it, the points of a scan, or a shot.
 
-    Of a campaign's folder, draw filling and defect-free fraction at its points.
+    For a campaign's folder, draw the results at its points.
     """
     from labseq.analysis.plotting import PlotRequest, plot_run
     from labseq.analysis.scanned import scan_request

@@ -1,4 +1,4 @@
-"""`labseq compare` and `labseq trend`: what several runs measured, overlaid or over time."""
+"""`labseq compare` and `labseq trend`: results of several runs, overlaid or over time."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compared:
-    """A quantity of one of the runs that are compared.
+    """A quantity of one of the compared runs.
 
     Attributes:
-        entry: The run as lists show it.
+        entry: The run as an entry in the list of runs.
         quantity: The quantity.
         mean: Its mean over all shots.
-        axis: The scanned address; None without a scan of one numerical value.
+        axis: The scanned address. None without a scan of one numerical value.
         x: The scanned value at each point, in the unit of the axis, rising.
         means: The quantity at each point.
-        fit: The fit that the run's sequence asks for; None if it asks for none or it failed.
-        result: The parameter of it that the sequence asks for.
+        fit: The fit that the run's sequence asks for. None if there is none or it failed.
+        result: The parameter of the fit that the sequence reports.
     """
 
     entry: RunEntry
@@ -66,11 +66,11 @@ class Compared:
 
     @classmethod
     def of(cls, run: Run, name: str) -> Compared:
-        """The quantity of a run.
+        """Evaluate a quantity of a run.
 
         Raises:
             ConfigError: The run has no such quantity.
-            RecordingError: It is damaged.
+            RecordingError: The run is damaged.
         """
         quantity, scan = find_quantity(run, name), scanned(run)
         on_axis = scan.on_axis(0) if scan is not None and len(scan.axes) == 1 else None
@@ -92,18 +92,18 @@ class Comparison:
 
     @classmethod
     def of(cls, opened: Sequence[Run], name: str | None = None) -> Comparison:
-        """Compare runs by a quantity, by default what the first of them measures.
+        """Compare runs by a quantity. Default: what the first run measures.
 
         Raises:
             ConfigError: A run has no such quantity.
-            RecordingError: One is damaged.
+            RecordingError: A run is damaged.
         """
         wanted = name or measured_by(opened[0])[0]
         return cls(tuple(Compared.of(run, wanted) for run in opened))
 
     @property
     def _settings(self) -> list[dict[str, str]]:
-        """The changed settings of each run in which the runs differ."""
+        """The changed settings of each run that are not the same in all runs."""
         all_changes = [{"sequence": run.entry.name, **run.entry.changes} for run in self.runs]
         common = set.intersection(*({*changes.items()} for changes in all_changes))
         return [{a: v for a, v in changes.items() if (a, v) not in common} for changes in all_changes]
@@ -124,7 +124,7 @@ class Comparison:
         return {"runs": compared}
 
     def as_text(self) -> list[str]:
-        """A row for each run: mean over all shots, fitted values, and in which settings the runs differ."""
+        """A row for each run: mean over all shots, fitted values, and settings in which the runs differ."""
         names = list(dict.fromkeys(name for run in self.runs if run.fit for name in run.fit.free))
         rows = [("run", title_of(self.runs[0].quantity), *names, "chi-square", "shots", "settings", "note")]
         for run, settings in zip(self.runs, self._settings, strict=True):
@@ -146,7 +146,7 @@ class Comparison:
         return aligned(filled_columns(rows))
 
     def picture(self) -> RunPicture:
-        """The scans of the runs, one over the other, with their fits; without scans, the means side by side.
+        """The scans of the runs in one panel, with their fits. Without scans, the means side by side.
 
         Raises:
             ConfigError: The runs scan different addresses, or no shot has a value.
@@ -216,7 +216,7 @@ class TrendPoint:
     Attributes:
         entry: The run.
         value: The number.
-        new_calibrations: Kinds whose calibration is another one than in the run before.
+        new_calibrations: Kinds of calibrations that changed since the run before.
     """
 
     entry: RunEntry
@@ -238,7 +238,7 @@ class Trend:
 
     @classmethod
     def of(cls, name: str, data: Path | None, conditions: Mapping[str, Any]) -> Trend:
-        """Look a number up in all runs that meet conditions, see :func:`labseq.data.catalogue.runs`.
+        """Look up a number in all runs that meet conditions, see :func:`labseq.data.catalogue.runs`.
 
         Args:
             name: A fitted parameter, a quantity, or a setting that was changed by ``--set``.
@@ -246,7 +246,7 @@ class Trend:
             conditions: Arguments of that function.
 
         Raises:
-            ConfigError: No run has it, or a condition cannot be read.
+            ConfigError: No run has the number, or a condition cannot be read.
         """
         points, before, others = list[TrendPoint](), dict[str, str](), dict[str, None]()
         for entry in reversed([*runs(data, **conditions)]):
@@ -290,12 +290,12 @@ class Trend:
         """The number against the time, with a line where a calibration has changed.
 
         Raises:
-            ConfigError: It has several units, such as the centres of scans of a time and of a frequency.
+            ConfigError: The number has several units, such as the centres of scans of time and frequency.
         """
         units = list(dict.fromkeys(point.value.text_unit for point in self.points))
         if len(units) > 1:
             what = f"'{clean(self.name)}' has several units: {' and '.join(unit or 'none' for unit in units)}"
-            expected = "runs in which it has one, chosen for example by --sequence"
+            expected = "runs in which it has one unit, for example by --sequence"
             raise ConfigError(Problem(what, expected=expected))
         n_runs = plural(len(self.points), "run")
         return RunPicture(f"{clean(self.name)} of {n_runs}", "", ((self._draw,),))
@@ -321,7 +321,7 @@ class Trend:
 
 
 def _number(entry: RunEntry, name: str) -> Parameter | None:
-    """A number of a run: a result, a changed setting, or a quantity of its shots; None if it has none."""
+    """A number of a run: a result, a changed setting, or a quantity of its shots. None if it has none."""
     for result in entry.results:
         if result.name == name and not result.at:
             return result.value
@@ -340,7 +340,7 @@ def _text(value: Parameter) -> str:
 
 
 def compare_runs(paths: Sequence[Path], name: str | None, output: Path | None, *, as_json: bool) -> None:
-    """Print runs beside one another, and draw their scans one over the other."""
+    """Print runs side by side, and draw their scans in one panel."""
     comparison = Comparison.of([chosen_run(path) for path in paths], name)
     _print_and_draw(comparison, output, as_json=as_json)
 
@@ -348,7 +348,7 @@ def compare_runs(paths: Sequence[Path], name: str | None, output: Path | None, *
 def show_trend(
     name: str, data: Path | None, conditions: Mapping[str, Any], output: Path | None, *, as_json: bool
 ) -> None:
-    """Print a number of many runs, and draw it over the time."""
+    """Print a number of many runs, and draw it over time."""
     _print_and_draw(Trend.of(name, data, conditions), output, as_json=as_json)
 
 

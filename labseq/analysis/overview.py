@@ -89,9 +89,9 @@ class RunPicture:
     """Panels of a run, row by row.
 
     Attributes:
-        title: Title.
-        note: Line below it.
-        rows: The panels; no row is empty.
+        title: Title at the top.
+        note: Line below the title.
+        rows: The panels. No row is empty.
     """
 
     title: str
@@ -129,11 +129,11 @@ class RunPicture:
 
 
 def overview(run: Run) -> RunPicture:
-    """All panels of a run. Those that need shot files may use part of the shots, as their titles then say.
+    """All panels of a run. Panels that need shot files may use part of the shots, as their titles then say.
 
     Raises:
-        ConfigError: It has no shots yet.
-        RecordingError: It is damaged.
+        ConfigError: The run has no shots yet.
+        RecordingError: The run is damaged.
     """
     summary = _Summary(_with_shots(run), 60)  # files of shots, which take half a second to read
     survival, timing = summary.read
@@ -157,8 +157,8 @@ def picture_of(run: Run, what: str) -> RunPicture:
         what: One of :data:`CHOICES`.
 
     Raises:
-        ConfigError: There is no such part, or the run lacks the data for it; says which.
-        RecordingError: It is damaged.
+        ConfigError: There is no such part, or the run lacks the data for it. The message says which.
+        RecordingError: The run is damaged.
     """
     if what not in CHOICES:
         problem = f"there is no picture '{clean(what)}' of a run"
@@ -171,7 +171,7 @@ def picture_of(run: Run, what: str) -> RunPicture:
 
 
 def cycles_panel(quantity: Quantity, statistics: Statistics) -> Panel | None:
-    """A fraction against the cycle, from the image at the end of each cycle; None without cycles."""
+    """A fraction against the cycle, from the image at the end of each cycle. None without cycles."""
     cycles = statistics.cycles
     if not cycles:
         return None
@@ -189,7 +189,7 @@ def cycles_panel(quantity: Quantity, statistics: Statistics) -> Panel | None:
 
 
 def survival_panels(run: Run, survival: Survival) -> Row:
-    """Maps of the sites: survival of moved atoms, and of those that stayed."""
+    """Maps of the sites: survival of moved atoms, and of atoms that stayed."""
 
     def panel(counts: SurvivalCounts, title: str) -> Panel:
         low, high = counts.rate.interval
@@ -208,7 +208,7 @@ def survival_panels(run: Run, survival: Survival) -> Row:
 
 
 def lost_by_cycle(run: Run, survival: Survival) -> Panel | None:
-    """The fraction of the atoms that the next image does not show, for each cycle; None without cycles."""
+    """The fraction of atoms missing on the next image, for each cycle. None without cycles."""
     cycles = range(len(survival.by_cycle))
     curves = {
         name: points_of(cycles, [_lost(pair[kind].rate) for pair in survival.by_cycle])
@@ -236,7 +236,7 @@ def defects_panel(run: Run, statistics: Statistics) -> Panel | None:
 
 
 def stages_panel(run: Run, timing: RunTiming) -> Panel | None:
-    """The durations of a shot's stages and their budgets; None without stages."""
+    """The durations of a shot's stages and their budgets. None without stages."""
     stages = [stage for stage in timing.stages if not stage.stage.startswith(STEP)]
     if not stages:
         return None
@@ -249,10 +249,10 @@ def stages_panel(run: Run, timing: RunTiming) -> Panel | None:
 def scan_panels(
     scan: Scanned, quantity: Quantity, means: Sequence[Estimated], fits: Sequence[FitAt] = ()
 ) -> Row:
-    """A quantity against the scanned values: a curve for one axis, maps for more; empty if it is unknown.
+    """A quantity against the scanned values: a curve for one axis, maps for more. Empty if it is unknown.
 
     Args:
-        scan: The points.
+        scan: The points of the scan.
         quantity: The quantity.
         means: Its mean at each point.
         fits: Its fits.
@@ -295,7 +295,7 @@ def _scan_curve(
     values, unit = numbers
     rows = sorted(zip(values, means, strict=True), key=lambda row: row[0])
     below = [f"{axis.address} ({unit})" if unit else axis.address]
-    if fit is not None:  # a legend would hide points: those of an oscillation are everywhere
+    if fit is not None:  # a legend would hide points, which for an oscillation are everywhere
         below.append(fit.caption())
     return partial(
         draw_curves,
@@ -311,7 +311,7 @@ def _scan_curve(
 
 
 def _parameter_panels(scan: Scanned, fits: Sequence[FitAt]) -> Row:
-    """Each fitted parameter against the axis that the fits are not along; none if there are more."""
+    """Each fitted parameter against the remaining axis. Empty if there are several remaining axes."""
     made = [(at, at.fit) for at in fits if at.fit is not None]
     if not made or len(made[0][0].values) != 1:
         return ()
@@ -343,7 +343,7 @@ def _fitted(fit: Fit, factor: float, x: np.ndarray[Any, Any]) -> np.ndarray[Any,
 
 
 def _scan_maps(scan: Scanned, title: str, means: Sequence[float], label: str) -> Row:
-    """A map against the last two axes for each combination of the others."""
+    """A map against the last two axes for each combination of the other axes."""
     *others, y, x = scan.axes
     values = np.full([len(axis.labels) for axis in scan.axes], np.nan)
     for place, mean in zip(scan.places, means, strict=True):
@@ -373,11 +373,11 @@ def scan_picture(run: Run, request: ScanRequest) -> RunPicture:
     """Quantities at the points of a scan, with their fits.
 
     Raises:
-        ConfigError: The run has no scan; or see :func:`labseq.analysis.scanned.scan_report`.
+        ConfigError: The run has no scan, or see :func:`labseq.analysis.scanned.scan_report`.
     """
     report = scan_report(_with_shots(run), request)
     if not report.scan.axes:
-        expected = "a run of a sequence with 'scan:'; `labseq show --scan` prints the values of this one"
+        expected = "a run of a sequence with 'scan:'; `labseq show --scan` prints the values of this run"
         raise cannot_draw(run, "it has no scan", expected)
     fits = report.fits or ((),) * len(report.values)
     rows = [
@@ -399,10 +399,10 @@ def map_picture(run: Run, names: Sequence[str]) -> RunPicture:
 
     Args:
         run: The run.
-        names: The quantities; none for those that the run measures.
+        names: The quantities. Empty for the quantities that the run measures.
 
     Raises:
-        ConfigError: There is no such quantity, or it is not one of sites.
+        ConfigError: There is no such quantity, or it has no value for a site.
     """
     of_sites = [name for name in measured_by(run) if parse_name(name).kind in OF_IMAGES]
     shots = evenly(_with_shots(run).shots, PART_SHOTS)
@@ -431,7 +431,7 @@ def _map_panels(run: Run, sites: SiteMap) -> Row:
         ),
         partial(
             draw_sites,
-            title="difference to the mean,\nin errors of the site",
+            title="difference from the mean,\nin errors of the site",
             label="standard errors",
             values=sites.deviations,
             limit=max(3.0, float(np.nanmax(np.abs(sites.deviations), initial=0.0))),
@@ -459,7 +459,7 @@ class _Summary:
 
     @cached_property
     def scan(self) -> Scanned | None:
-        """The points of the scan, from the index; None without a scan."""
+        """The points of the scan, from the index. None without a scan."""
         return scanned(self.run)
 
     def quantity(self, name: str) -> Quantity:
@@ -467,7 +467,7 @@ class _Summary:
         return quantity_of(self.run, name)
 
     def scan_row(self, name: str) -> Row:
-        """A quantity at the points of the scan, with the fits of the sequence; empty without a scan."""
+        """A quantity at the points of the scan, with the fits of the sequence. Empty without a scan."""
         if self.scan is None:
             return ()
         if name not in self._scan_rows:
@@ -479,7 +479,7 @@ class _Summary:
 
     @cached_property
     def read(self) -> tuple[Survival, RunTiming]:
-        """Survival and times, from the files of some shots; unreadable ones are left out."""
+        """Survival and times, from the files of some shots. Unreadable files are left out."""
         # both in one pass, so that each file is read once
         survival, totals = Survival.empty(self.run.target.shape), StageTotals()
         loads = steps_that_load(self.run)
@@ -515,14 +515,14 @@ def _scan_rows(summary: _Summary) -> list[Row]:
 
 
 def _image_rows(summary: _Summary, draw: Callable[[Sequence[Shot]], Panel]) -> list[Row]:
-    """The panel of an image; none if no shot has what it needs."""
+    """The panel of an image. Empty if no shot has the data for it."""
     with suppress(RecordingError):
         return [(draw(evenly(summary.run.shots, PART_SHOTS)),)]
     return []
 
 
 def loading_panel(run: Run, shots: Sequence[Shot]) -> Panel:
-    """The fraction of the shots with an atom on each site, on the first image."""
+    """The fraction of shots with an atom on each site, on the first image."""
     values, n = loading_map(shots)
     title = f"loading: {100 * values.mean():.1f} % on the first image of {n} shots"
     site: dict[str, Any] = {"grid": grid_of(run), "outlined": run.target.fill}
@@ -591,7 +591,7 @@ CHOICES: Final[Mapping[str, tuple[str, Callable[[_Summary], list[Row]], str]]] =
         ),
     }
 )
-"""Part of the overview -> its title, its panels, and the data that it needs."""
+"""Part of the overview -> its title, function for its panels, and the data that it needs."""
 
 
 def evenly(shots: Sequence[T], n_most: int) -> list[T]:
@@ -606,7 +606,7 @@ def evenly(shots: Sequence[T], n_most: int) -> list[T]:
 
 
 def part_text(n_read: int, run: Run) -> str:
-    """The number of shots that were read, as text; "" for all."""
+    """The number of shots that were read, as text. "" if all were read."""
     n = len(run.shots)
     return "" if n_read == n else f", {n_read} of {n} shots"
 
@@ -639,10 +639,10 @@ def grid_of(run: Run) -> SiteGrid:
 
 
 def sites_of(run: Run) -> KnownSites | None:
-    """The positions of a run's sites on its frames, which the detector used.
+    """The positions of a run's sites on its frames, as the detector used them.
 
-    They come from the file in the detector's settings, from the calibration in the run's folder, or
-    from the settings.
+    They come from the file in the detector's settings, the calibration in the run's folder, or
+    the settings.
 
     Returns:
         None if the run does not contain them, or the file is missing.

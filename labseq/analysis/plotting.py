@@ -21,14 +21,14 @@ from labseq.pictures.figures import ENDINGS, check_place
 
 @dataclass(frozen=True, slots=True)
 class PlotRequest:
-    """The part of a run to draw; at most one of ``what``, ``scan``, ``sites`` and ``shot`` is given.
+    """The part of a run to draw. At most one of ``what``, ``scan``, ``sites`` and ``shot`` is given.
 
     Attributes:
-        what: A part of the overview; None for all of it.
+        what: A part of the overview. None for the whole overview.
         shot: A shot, counted from 0.
-        cycle: A cycle of it, counted from 0.
+        cycle: A cycle of the shot, counted from 0.
         scan: Quantities at the points of the scan.
-        sites: Quantities at each site; "" for those that the run measures.
+        sites: Quantities at each site. "" for the quantities that the run measures.
         where: Conditions on the shots that are drawn.
     """
 
@@ -52,7 +52,7 @@ class PlotRequest:
             problem = "these are different pictures"
             raise ConfigError(Problem(problem, " and ".join(options), expected="one of them"))
         if self.cycle is not None and self.shot is None:
-            raise ConfigError(Problem("a cycle belongs to a shot", "--cycle", expected="--shot as well"))
+            raise ConfigError(Problem("a cycle needs a shot", "--cycle", expected="--shot as well"))
 
     @property
     def name(self) -> str:
@@ -68,11 +68,11 @@ class PlotRequest:
 
 
 def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, replace: bool = False) -> None:
-    """Draw a run or a campaign; a file is replaced only on request."""
+    """Draw a run or a campaign. An existing file is replaced only on request."""
     request.check()
     folder = campaign_in(run)
     if folder is not None and request != PlotRequest():
-        problem = "a campaign has one picture; these options are for one of its runs"
+        problem = "these options are for a single run, and a campaign has only one picture"
         raise ConfigError(
             Problem(problem, visible(str(folder)), expected="no option but --output and --force")
         )
@@ -80,12 +80,12 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, rep
     ending = path.suffix.lower()
     if ending in ANIMATIONS and request.shot is None:
         what = "an animation shows one cycle of a shot"
-        raise ConfigError(Problem(what, visible(str(path)), expected="--shot N and --cycle K beside it"))
+        raise ConfigError(Problem(what, visible(str(path)), expected="--shot N and --cycle K as well"))
     check_place(path, ENDINGS if request.shot is None else (*ENDINGS, *ANIMATIONS), drawn=ending != ".html")
     if path.exists() and not replace:
         hint = "--force replaces it"
         raise ConfigError(
-            Problem("this file exists already", visible(str(path)), expected="a new name", hint=hint)
+            Problem("this file already exists", visible(str(path)), expected="a new name", hint=hint)
         )
     if folder is not None:
         campaign_picture(folder).save(path)
@@ -107,6 +107,6 @@ def plot_run(run: Path | None, request: PlotRequest, output: Path | None, *, rep
 
 
 def _free_name(name: str) -> Path:
-    """A PNG file of this name in the current folder, with a number if there is one already."""
+    """A PNG file of this name in the current folder, with a number if the file exists."""
     names = (Path(f"{name}_{i}.png" if i else f"{name}.png") for i in itertools.count())
     return next(path for path in names if not path.exists())

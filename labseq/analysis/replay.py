@@ -55,7 +55,7 @@ class ReplayedImage:
         n_vanished: Number of sites with an atom in the run only.
         confidence: Mean confidence in the run.
         confidence_replayed: Mean confidence in the replay.
-        n_atoms_true: True number of atoms after the shot's last image; None if unknown.
+        n_atoms_true: True number of atoms after the shot's last image. None if unknown.
     """
 
     shot: int
@@ -89,7 +89,7 @@ class ReplayedImages:
 
     @classmethod
     def none(cls, shape: tuple[int, int]) -> ReplayedImages:
-        """Empty results, to which shots are added."""
+        """Empty results to which shots are added."""
         return cls([], np.zeros(shape, np.int64), np.zeros(shape, np.int64))
 
     @property
@@ -142,8 +142,8 @@ class PlanCounts:
         n_batches: Number of batches.
         n_atom_moves: Number of atom moves.
         duration_s: From the start of the cycle to the end of its last batch.
-        planning_s: Planning time, on this computer or, if recorded, on that of the run; nan if unknown.
-        filling: Filling of the target after it, if no atom is lost.
+        planning_s: Planning time, on this computer or, if recorded, on the run's computer. nan if unknown.
+        filling: Filling of the target after the plan, if no atom is lost.
         meets_target: Whether the target is met after the plan, if no atom is lost.
     """
 
@@ -165,15 +165,15 @@ class PlanCounts:
 
 @dataclass(frozen=True, slots=True)
 class ReplayedPlan:
-    """A recorded plan, and the plan of a planner for the same image.
+    """A recorded plan, and the plan of the replayed planner for the same image.
 
     Attributes:
         shot: Index of the shot, from 0.
         step: Index of the step in the shot.
         cycle: Index of the cycle in its step.
         recorded: The plan of the run.
-        replayed: The plan of the replay; None if the planner failed, or its plan breaks a rule.
-        same: Whether both are the same, move by move.
+        replayed: The plan of the replay. None if the planner failed, or its plan breaks a rule.
+        same: Whether both plans are the same, move by move.
         failure: Why there is no plan of the replay, or "".
     """
 
@@ -187,10 +187,10 @@ class ReplayedPlan:
 
 
 def mean_counts(plans: Sequence[PlanCounts]) -> dict[str, Any]:
-    """Means over several plans, by the names of :class:`PlanCounts`; unknown times are left out.
+    """Means over several plans, by the names of :class:`PlanCounts`. Unknown times are left out.
 
     Returns:
-        Also ``n_plans``, and ``n_met``: the plans that meet the target if no atom is lost.
+        The means, ``n_plans``, and ``n_met``, the number of plans that meet the target if no atom is lost.
     """
     names = ("n_batches", "n_atom_moves", "duration_s", "planning_s", "filling")
     values = {name: np.array([getattr(plan, name) for plan in plans], np.float64) for name in names}
@@ -215,7 +215,7 @@ def _replay_plans(shot: Shot, planner: Planner, pipeline: _Pipeline, grid: SiteG
         replayed, same, failure = None, False, ""
         try:
             start_s = perf_counter()
-            # on the recorded occupancy: a replayed detector does not change what the planner gets
+            # on the recorded occupancy, because a replayed detector does not change the planner's input
             plan = call_planner(planner, name, image.occupancy, shot.target, guard)
             planning_s = perf_counter() - start_s
             report = check_plan(plan, image.occupancy, shot.target, dop, grid, pipeline.motion, name)
@@ -228,7 +228,7 @@ def _replay_plans(shot: Shot, planner: Planner, pipeline: _Pipeline, grid: SiteG
 
 
 def _planning_s(timing: Sequence[StageTiming], cycle: CycleRecord) -> float:
-    """The planning time on the run's computer, in seconds; nan if not recorded."""
+    """The planning time on the run's computer, in seconds. nan if not recorded."""
     place = ("plan", cycle.step, cycle.cycle)
     return next(
         (stage.host_s for stage in timing if (stage.stage, stage.step, stage.cycle) == place), math.nan
@@ -242,11 +242,11 @@ class ReplayRequest:
     If neither is given, the run's own planner and detector are replayed.
 
     Attributes:
-        planner: Another planner, with its default settings; None for the run's own.
+        planner: Another planner, with its default settings. None for the run's own.
         degree_of_parallelism: The planner's setting of that name.
-        detector: Another detector, with its default settings; None for the run's own.
+        detector: Another detector, with its default settings. None for the run's own.
         overrides: ``"planner.key=value"`` and ``"profile.detector.key=value"`` strings.
-        shots: The shots to replay, counted from 0: "3,5-9"; None for all.
+        shots: The shots to replay, counted from 0, such as "3,5-9". None for all.
     """
 
     planner: str | None = None
@@ -256,7 +256,7 @@ class ReplayRequest:
     shots: str | None = None
 
     def changes(self) -> dict[str, list[Override]]:
-        """The changes to the run: "planner" and "detector" -> overrides; unchanged ones are missing.
+        """The changes to the run: "planner" and "detector" -> overrides. Unchanged roles are missing.
 
         Raises:
             ConfigError: An override changes something else.
@@ -272,7 +272,7 @@ class ReplayRequest:
         for kind, options in (("planner", for_sequence), ("detector", for_profile)):
             for override in options:
                 if not override.address.startswith(f"{kind}."):
-                    problem = "a replay changes nothing but the planner and the detector"
+                    problem = "a replay can only change the planner and the detector"
                     expected = "an address that begins with 'planner.' or 'profile.detector.'"
                     raise ConfigError(Problem(problem, override.source, expected=expected))
                 changes[kind].append(override._replace(origin=override.source))
@@ -285,10 +285,10 @@ class Replay:
 
     Attributes:
         run: The run.
-        is_own: Whether the run's own planner and detector were replayed, so that all results must agree.
-        used: "planner" or "detector" -> the replayed plugin; for a scan, at its first point.
-        changed: Its settings that differ from the defaults.
-        n_shots: Shots that were read.
+        is_own: True if the run's own planner and detector were replayed, so that all results must agree.
+        used: "planner" or "detector" -> the replayed plugin. For a scan, at its first point.
+        changed: "planner" or "detector" -> settings that differ from the defaults.
+        n_shots: Number of shots that were read.
         plans: Each recorded plan, and the replayed plan for the same image.
         images: Results of the detector on the recorded frames.
         unreadable: Index of a shot -> why it could not be read.
@@ -345,7 +345,7 @@ class _Replayer:
         context = Context(grid=self.grid, motion=motion, calibrations=self._calibrations)
         plugins, streams = construct(choices, context, self._seed)
         for plugin in plugins.values():
-            if isinstance(plugin, NeedsWarmUp):  # or the first time to plan would be that of compiling
+            if isinstance(plugin, NeedsWarmUp):  # or the first planning time would include compiling
                 plugin.warm()
         return _Pipeline(plugins, choices, motion, streams)
 
@@ -366,7 +366,7 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
     Settings, calibrations and motion are the run's own, from its folder.
 
     Args:
-        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
+        announce: Called before kernels are compiled, with the approximate compile time in seconds.
 
     Raises:
         ConfigError: The request has an error, or the run can no longer be assembled.
@@ -386,7 +386,7 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
         choices = replayer.at(assembly.first_point).choices
         for shot in shots:
             pipeline = replayer.at(_point_of(shot, assembly, point_of_shot))
-            # a planner that draws random numbers gets those of the run
+            # a planner that draws random numbers gets the same ones as in the run
             for stream in pipeline.streams:
                 stream.begin_shot(shot.index, shot.attempt)
             try:
@@ -409,7 +409,7 @@ def replay(run: Run, request: ReplayRequest, *, announce: Callable[[float], None
 
 
 def _point_of(shot: Shot, assembly: Assembly, point_of_shot: Sequence[int]) -> Point:
-    """The settings that a recorded shot was taken with."""
+    """The settings with which a recorded shot was taken."""
     if assembly.search is None:
         return assembly.at(point_of_shot[shot.index])
     return assembly.search.at(assembly.search.values_in(shot.row.parameters))
@@ -420,7 +420,7 @@ def assembly_of(run: Run) -> Assembly:
 
     Raises:
         ConfigError: The run can no longer be assembled.
-        RecordingError: Its recorded files are missing.
+        RecordingError: The run's recorded files are missing.
     """
     options = replace(Options.of(run.changes), dry_run="fast")
     return assemble_recorded(files_of(run)._replace(calibrations={}), options)

@@ -46,7 +46,7 @@ def replay_run(path: Path | None, request: ReplayRequest, output: Path | None, *
 
 @dataclass(frozen=True, slots=True)
 class ReplayReport:
-    """The comparison of a replay with the run: shots and images counted from 0, times in seconds."""
+    """The comparison of a replay with the run. Shots and images count from 0, times are in seconds."""
 
     replay: Replay
 
@@ -118,13 +118,13 @@ def _plan_lines(result: Replay) -> list[str]:
         rows.append((f"{label}, replayed", mean_counts(_replayed_counts(plans))))
     n_same, n_failed = sum(plan.same for plan in result.plans), sum(bool(p.failure) for p in result.plans)
     lines = [_title("planner", result.used["planner"], result.changed["planner"]), *table(rows, PLANS)]
-    lines.append("means per plan; filling and target as predicted if no atom is lost")
+    lines.append("means per plan, with filling and target as predicted if no atom is lost")
     lines.append(f"the same as recorded: {count_of(n_same, len(result.plans))}")
     return [*lines, f"INVALID: {count_of(n_failed, len(result.plans))}"] if n_failed else lines
 
 
 def _groups(plans: Sequence[ReplayedPlan]) -> Iterator[tuple[str, list[ReplayedPlan]]]:
-    """The plans of each cycle, then of all; cycles are counted from 0 over all rearrangements of a shot."""
+    """The plans of each cycle, then of all. Cycles count from 0 over all rearrangements of a shot."""
     by_cycle: dict[int, list[ReplayedPlan]] = {}
     last: dict[int, int] = {}
     for plan in plans:
@@ -188,14 +188,14 @@ def _map(images: ReplayedImages) -> list[str]:
         return []
     kinds = np.array([".", "+", "-", "*"])[(images.appeared > 0) + 2 * (images.vanished > 0)]
     rows = [" ".join(row) for row in kinds.tolist()]
-    return ["", "+ atom, none before; - no atom, one before; * both", *rows]
+    return ["", "+ atom, none before   - no atom, one before   * both", *rows]
 
 
 def _failure_lines(result: Replay) -> list[str]:
     lines = [f"shot {plan.shot}, cycle {plan.cycle}: {plan.failure}" for plan in result.plans if plan.failure]
     lines += [f"shot {s}, image {i}: {text}" for (s, i), text in result.images.failures.items()]
     lines += [f"shot {shot} is left out: {text}" for shot, text in result.unreadable.items()]
-    return first_of(lines, "more; all of them with --output FILE")
+    return first_of(lines, "more; --output FILE writes all of them")
 
 
 def _plan_values(plans: Sequence[ReplayedPlan]) -> dict[str, Any]:

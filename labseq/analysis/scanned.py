@@ -1,4 +1,4 @@
-"""What is printed of a scan: the quantities at its points and their fits."""
+"""What commands print of a scan: the quantities at its points and their fits."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class ScanRequest:
     """The quantities to show at the points of a scan, and their fits.
 
     Attributes:
-        names: Names of the quantities; none for those that the run measures.
-        fit: The fit of each; None for those that its sequence asks for.
+        names: Names of the quantities. Empty for the quantities that the run measures.
+        fit: The fit of each quantity. None for the fits that the run's sequence asks for.
     """
 
     names: tuple[str, ...] = ()
@@ -48,7 +48,7 @@ def scan_request(
     fit_settings: Sequence[str] | None = None,
     along: str | None = None,
 ) -> ScanRequest | None:
-    """The options of a command as a request; None if there are none.
+    """The options of a command as a request. None if no option is given.
 
     Raises:
         ConfigError: Settings of a fit are given without a fit, or without a value.
@@ -77,7 +77,7 @@ class ScanReport:
     Attributes:
         scan: The points.
         values: Each quantity with its mean at each point.
-        fits: The fits of each quantity, at each combination of the other axes; empty without.
+        fits: The fits of each quantity, at each combination of the other axes. Empty without fits.
     """
 
     scan: Scanned
@@ -85,7 +85,7 @@ class ScanReport:
     fits: tuple[list[FitAt], ...] = ()
 
     def as_text(self) -> list[str]:
-        """A map for each quantity if all pairs of two values were scanned, else a table; then the fits."""
+        """A map for each quantity if all pairs of two values were scanned, else a table. Then the fits."""
         axes, n_places = self.scan.axes, len({*self.scan.places})
         if len(axes) == 2 and n_places == math.prod(len(axis.labels) for axis in axes):
             tables = [
@@ -105,7 +105,7 @@ class ScanReport:
         """A row for each point.
 
         Args:
-            most: Maximum number of rows; 0 for all.
+            most: Maximum number of rows. 0 for all.
         """
         written = [tuple(map(clean, point.written.values())) for point in self.scan.points]
         header = (*map(clean, self.scan.points[0].written), "shots", *(title_of(q) for q, _ in self.values))
@@ -135,7 +135,7 @@ class ScanReport:
         return [*title, *aligned([header, *rows], right=range(len(header)))]
 
     def as_json(self) -> dict[str, Any]:
-        """The points and fits, SI: points are counted from 0."""
+        """The points, counted from 0, and fits, in SI."""
         points = [
             {
                 "parameters": dict(point.parameters),
@@ -153,7 +153,7 @@ class ScanReport:
         return {"points": points} | ({"fits": fits} if fits else {})
 
     def columns(self, units: Mapping[str, str]) -> list[Column]:
-        """A row for each point, SI: scanned values, shots, quantities and their intervals.
+        """A table in SI with a row for each point: scanned values, shots, quantities and their intervals.
 
         Args:
             units: Address -> SI unit.
@@ -179,7 +179,7 @@ class ScanReport:
 
 
 def scan_report(run: Run, request: ScanRequest) -> ScanReport:
-    """Quantities at the points of a run's scan; without a scan, over all shots.
+    """Evaluate quantities at the points of a run's scan. Without a scan, over all shots.
 
     Raises:
         ConfigError: The run has no shots, there is no such quantity, or the fit cannot be made.
@@ -199,7 +199,7 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
     fit = request.fit
     fits: tuple[list[FitAt], ...] = ()
     if fit is not None:
-        # without a name, that of the first: a model suits one quantity, and not those beside it
+        # without a name, only the first quantity, because a model rarely suits the others
         wanted = quantities if request.names else quantities[:1]
         fits = _fits_of(run, scan, [one for one in values if one[0] in wanted], fit)
         fits += ([],) * (len(values) - len(wanted))
@@ -211,10 +211,10 @@ def scan_report(run: Run, request: ScanRequest) -> ScanReport:
 def _fits_of(
     run: Run, scan: Scanned, values: Sequence[tuple[Quantity, list[Estimated]]], request: FitRequest
 ) -> tuple[list[FitAt], ...]:
-    """The fits of each quantity; of several, one that fails does not hide the others.
+    """The fits of each quantity. If one of several fails, the others are still shown.
 
     Raises:
-        ConfigError: None can be fitted.
+        ConfigError: No quantity can be fitted.
     """
     fits: list[list[FitAt]] = []
     errors: list[ConfigError] = []
@@ -232,7 +232,7 @@ def _fits_of(
 
 
 def results_of(run: Run, report: ScanReport) -> list[tuple[str, str]]:
-    """The results of a run: name and value of the parameter that its sequence asks for, in each fit."""
+    """The results of a run: name and value of the parameter that its sequence reports, in each fit."""
     rows: list[tuple[str, str]] = []
     is_one = sum(map(bool, report.fits)) == 1
     for (quantity, _), fits in zip(report.values, report.fits, strict=False):
@@ -254,18 +254,18 @@ def _aim(run: Run) -> tuple[str, ...]:
 
 
 def _doubt(fit: Fit) -> str:
-    """What a value's error does not tell: that the points do not follow the model."""
+    """A warning that the points do not follow the model, which a value's error does not show."""
     if follows(fit) or math.isnan(fit.reduced_chi_square):
         return ""
     return f" (reduced chi-square {fit.reduced_chi_square:.2g}: the points do not follow the model)"
 
 
 def fit_lines(fits: Sequence[FitAt], of: str = "") -> list[str]:
-    """A fit with a line for each parameter; several as a table, with the reasons of those that failed.
+    """A fit with a line for each parameter. Several fits are a table, followed by the reasons of failures.
 
     Args:
-        fits: The fit, or those at each value of the other axes.
-        of: What is fitted, if it must be named: " of filling".
+        fits: The fit, or the fits at each value of the other axes.
+        of: Name of the fitted quantity if it must be given, such as " of filling".
     """
     made = [at.fit for at in fits if at.fit is not None]
     if not made:
@@ -300,7 +300,7 @@ def value_text(value: Estimated, quantity: Quantity, *, short: bool = False) -> 
 
 
 def shown_unit(quantity: Quantity, values: Sequence[float]) -> tuple[str, float]:
-    """A unit in which values of a quantity are readable, and its factor to SI."""
+    """A unit in which values of a quantity are easy to read, and its factor to SI."""
     if quantity.is_fraction:
         return "%", 0.01
     sizes = [abs(value) for value in values if math.isfinite(value)]

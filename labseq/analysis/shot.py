@@ -57,10 +57,10 @@ ON_FRAME: Final = (
     MarkerStyle("surplus atom", "s", 0.8, "none", "#f0e442"),
     MarkerStyle("atom in the reservoir", "o", 0.86, "none", "0.62"),
 )
-"""Colours of the rings around sites, from Okabe and Ito, visible on grey for all colour vision."""
+"""Colours of the rings around sites, from Okabe and Ito, visible on grey for all kinds of colour vision."""
 OUTLINE: Final = "#c8102e"
 COLOURS: Final = ("plasma", 0.25, 0.95)
-"""Colour map of the order of batches, and the part of it that is visible on black and on white."""
+"""Colour map of the order of batches, and the part of it that is visible on black and white."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,9 +70,9 @@ class ShotPanel:
     Attributes:
         title: Title above the panel.
         occupancy: bool (n_rows, n_cols), as detected.
-        image: uint16 (height, width); None if the frame was not recorded.
+        image: uint16 (height, width). None if the frame was not recorded.
         moves: int16 (n, 4), the atom moves that followed: from row, from column, to row, to column.
-        batch: int64 (n,), the batch of each, from 0.
+        batch: int64 (n,), the batch of each move, from 0.
     """
 
     title: str
@@ -91,9 +91,9 @@ class ShotDrawing:
         note: Line below the title.
         grid: The grid of sites.
         target: The target pattern.
-        sites_px: float64 (n_rows, n_cols, 2), (y, x) of each site on the frames; None if unknown;
-            then no frames are drawn.
-        panels: The images, in order; at least one.
+        sites_px: float64 (n_rows, n_cols, 2), (y, x) of each site on the frames. None if unknown, and then
+            no frames are drawn.
+        panels: The images in order, at least one.
     """
 
     title: str
@@ -172,7 +172,7 @@ def _lay_under(
     low, high = limits
     drawn = axes.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest", zorder=0)
     drawn.set_transform(Affine2D(matrix) + axes.transData)
-    # separates the frame from its neighbours; the outer half of its 6 points is not visible
+    # separates the frame from its neighbours, and the outer half of its 6 points is not visible
     rim: dict[str, Any] = {"fill": False, "edgecolor": "white", "linewidth": 6, "zorder": 5}
     axes.add_patch(Rectangle((0.0, 0.0), 1.0, 1.0, transform=axes.transAxes, **rim))
 
@@ -196,11 +196,11 @@ def _mark(
 
 
 def _limits(drawing: ShotDrawing) -> tuple[float, float]:
-    """The counts that are drawn black and white, the same in all panels."""
+    """The counts that are drawn as black and as white, the same in all panels."""
     images = [panel.image for panel in drawing.panels if panel.image is not None]
     if not images:
         return 0.0, 1.0
-    # without the extremes, as a hot pixel would darken all others
+    # without the extremes, because a hot pixel would darken all others
     low, high = np.quantile(np.concatenate([image.ravel() for image in images]), (0.01, 0.998))
     return float(low), float(max(high, low + 1))
 
@@ -239,16 +239,16 @@ def _write_head(figure: Figure, sheet: Sheet, drawing: ShotDrawing, looks: list[
 
 
 MAX_SITES = 128
-"""Maximum number of rows and of columns of an array that is drawn."""
+"""Maximum number of rows and columns of an array that is drawn."""
 
 
 def shot_picture(run: Run, index: int, cycle: int | None = None) -> ShotDrawing:
     """The images of a shot with the detected atoms and the moves that followed.
 
     Args:
-        index: Index of the shot, from 0. Of one that did not complete, the last attempt.
-        cycle: Only this cycle, counted from 0 over all rearrangements of the shot: the image that it was
-            planned on, and the one that ended it.
+        index: Index of the shot, from 0. If the shot did not complete, its last attempt is drawn.
+        cycle: Only this cycle, counted from 0 over all rearrangements of the shot. Draws the image on which
+            it was planned and the image that ended it.
 
     Raises:
         ConfigError: There is no such shot or cycle, it has no images, or the array is too large.
@@ -257,7 +257,7 @@ def shot_picture(run: Run, index: int, cycle: int | None = None) -> ShotDrawing:
     shot = _shot(run, index)
     record, target = shot.record(), run.target
     if max(target.shape) > MAX_SITES:
-        problem = f"{target.shape[0]} x {target.shape[1]} sites are too many to be made out"
+        problem = f"{target.shape[0]} x {target.shape[1]} sites are too many to draw"
         raise cannot_draw(run, problem, f"at most {MAX_SITES} rows and columns")
     if not record.images:
         raise cannot_draw(run, f"shot {index} has no images", "a shot with an 'image' step")
@@ -269,9 +269,9 @@ def shot_picture(run: Run, index: int, cycle: int | None = None) -> ShotDrawing:
     fits = sites is not None and all(image.shape == sites.frame for image in frames)
     no_frames = ""
     if not frames:
-        no_frames = "; no frames: not kept"
+        no_frames = "; no frames: they were not kept"
     elif not fits:
-        no_frames = "; no frames: their size is not that of the sites"
+        no_frames = "; no frames: their size does not fit the sites"
     ended = "" if shot.status == "complete" else f", {shot.status}: {clean(record.error)}"
     return ShotDrawing(
         title=f"shot {index}{ended}",
@@ -287,11 +287,11 @@ def shot_animation(run: Run, index: int, cycle: int | None = None) -> Animation:
     """The motion in a cycle of a shot, and the atoms that were lost.
 
     Args:
-        index: Index of the shot, from 0. Of one that did not complete, the last attempt.
-        cycle: The cycle, counted from 0 over all rearrangements of the shot; may be None if there is one.
+        index: Index of the shot, from 0. If the shot did not complete, its last attempt is drawn.
+        cycle: The cycle, counted from 0 over all rearrangements of the shot. None if there is only one.
 
     Raises:
-        ConfigError: There is no such shot or cycle, none of several is named, or the array is too large.
+        ConfigError: There is no such shot or cycle, several cycles but none given, or the array is too large.
         RecordingError: The shot's file is damaged.
     """
     shot = _shot(run, index)
@@ -311,7 +311,7 @@ def shot_animation(run: Run, index: int, cycle: int | None = None) -> Animation:
 
 
 def _no_cycle(run: Run, index: int, cycle: int, n_cycles: int) -> ConfigError:
-    expected = f"one from 0 to {n_cycles - 1}" if n_cycles else "a shot that rearranges"
+    expected = f"a cycle from 0 to {n_cycles - 1}" if n_cycles else "a shot that rearranges"
     problem = f"shot {index} of {clean(run.path.name)} has no cycle {cycle}"
     return ConfigError(Problem(problem, "--cycle", expected=expected))
 
@@ -320,7 +320,7 @@ def _shot(run: Run, index: int) -> Shot:
     attempts = [shot for shot in (*run.attempts, *run.shots) if shot.index == index]
     if not attempts:
         indices = sorted({shot.index for shot in (*run.shots, *run.attempts)})
-        expected = f"one from {indices[0]} to {indices[-1]}" if indices else "a run that has shots"
+        expected = f"a shot from {indices[0]} to {indices[-1]}" if indices else "a run that has shots"
         raise ConfigError(Problem(f"the run has no shot {index}", "--shot", expected=expected))
     return attempts[-1]
 

@@ -20,25 +20,25 @@ from labseq.recording.index import IndexRow
 Counts = NDArray[np.int64]
 
 LOST: Final = "lost."
-"""Prefix of a simulation's losses among its readings."""
+"""Prefix of the readings in which a simulation reports its losses."""
 
 
 @dataclass(frozen=True, slots=True)
 class CycleStatistics:
-    """Statistics of one cycle, over the shots that made it.
+    """Statistics of one cycle over the shots that reached it.
 
-    Standard errors are over shots, not sites: the losses within a shot are correlated.
+    Standard errors are over shots, not sites, because the losses within a shot are correlated.
 
     Attributes:
-        cycle: Its index, from 0, over all rearrangements of the shot.
-        n_shots: Number of shots that made it.
+        cycle: Index of the cycle, from 0, over all rearrangements of the shot.
+        n_shots: Number of shots that reached it.
         defect_free: Shots in which the image that ends it is defect-free.
-        seen: Shots in which that image, or one at the end of an earlier cycle, is defect-free.
+        seen: Shots in which that image, or the image at the end of an earlier cycle, is defect-free.
         filling: Filling of the target on that image.
-        n_atom_moves: Atom moves that were played.
-        n_batches: Batches that were played.
+        n_atom_moves: Number of atom moves that were played.
+        n_batches: Number of batches that were played.
         n_left_out: Number of batches that did not fit into the window.
-        period_s: Time from the start of the exposure before it to the start of its own.
+        period_s: Time from the start of the previous exposure to the start of its own.
         defects: Number of shots with 0, 1, 2, ... empty target sites on its image.
     """
 
@@ -61,13 +61,13 @@ class Statistics:
     Attributes:
         n_shots: Number of shots.
         defect_free: Judged shots that met the target. A shot is judged on its last ``image``
-            step, if it does not rearrange after that.
+            step, if no rearrangement follows.
         seen: Shots in which some image after a rearrangement is defect-free.
         filling: Filling of the target in the judged shots.
         cycles: Statistics of each cycle.
         defects: Number of judged shots with 0, 1, 2, ... empty target sites on that image.
         too_short: Shots in which the plan of a cycle did not fit into its window.
-        losses: Cause -> atoms lost in a shot, known in simulations; empty on real hardware.
+        losses: Cause -> atoms lost in a shot, known in simulations. Empty on real hardware.
         defects_true: Empty target sites at the end of a shot, known in simulations.
         defects_seen: Empty target sites on the last image of the same shots.
     """
@@ -85,7 +85,7 @@ class Statistics:
 
 
 def statistics_of(shots: Iterable[Shot], target: TargetPattern) -> Statistics:
-    """Compute the statistics of shots from the index, or from their files if needed; no frames are read."""
+    """Compute the statistics of shots from the index, or from their files if needed. Reads no frames."""
     rows = [shot.row for shot in shots]
     judged = [row for row in rows if not math.isnan(row.filling_fraction) and row.ends_with_image_step]
     # the same shots for both, so that true and seen defects can be compared
@@ -141,7 +141,7 @@ def _cycles(rows: Sequence[IndexRow], target: TargetPattern) -> tuple[CycleStati
         _cycle(
             i,
             [cycles[i] for cycles in per_shot if len(cycles) > i],
-            # a shot that ended after fewer cycles stays as it was
+            # a shot that ended after fewer cycles keeps its last result
             Rate(sum(any(met[: i + 1][-1:]) for met in seen), len(seen)),
             target.n_atoms,
         )
@@ -150,12 +150,12 @@ def _cycles(rows: Sequence[IndexRow], target: TargetPattern) -> tuple[CycleStati
 
 
 def _cycle(i: int, cycles: Sequence[_ShotCycle], seen: Rate, n_atoms: int) -> CycleStatistics:
-    """Statistics of the cycle of index i.
+    """Statistics of the cycle with index i.
 
     Args:
-        cycles: It in each shot that made it.
+        cycles: This cycle in each shot that reached it.
         seen: See :class:`CycleStatistics`.
-        n_atoms: Atoms of the target.
+        n_atoms: Number of atoms in the target.
     """
     defects = np.array([cycle.n_defects for cycle in cycles])
     return CycleStatistics(
@@ -189,8 +189,8 @@ class SurvivalCounts:
     """Number of atoms expected and seen on each site.
 
     Attributes:
-        n_expected: int64 (n_rows, n_cols).
-        n_seen: int64 (n_rows, n_cols), number of these detected on the next image.
+        n_expected: int64 (n_rows, n_cols), number of atoms expected.
+        n_seen: int64 (n_rows, n_cols), number of expected atoms that the next image shows.
     """
 
     n_expected: Counts
@@ -203,7 +203,7 @@ class SurvivalCounts:
 
     @property
     def fractions(self) -> NDArray[np.float64]:
-        """The survival on each site, float64 (n_rows, n_cols); NaN where no atom was expected."""
+        """The survival on each site, float64 (n_rows, n_cols). NaN where no atom was expected."""
         with np.errstate(invalid="ignore"):
             return np.where(self.n_expected > 0, self.n_seen / np.maximum(self.n_expected, 1), np.nan)
 
@@ -215,13 +215,13 @@ class SurvivalCounts:
 
 @dataclass(slots=True, eq=False)
 class Survival:
-    """Survival of atoms between an image and the next one.
+    """Survival of atoms from one image to the next.
 
-    As detected: an atom that is missed counts as lost, and another atom on its site counts as
-    the atom.
+    Counts atoms as detected. An atom that the detector misses counts as lost, and another atom on its site
+    counts as the atom.
 
     Attributes:
-        moved: Atoms that were moved, by the site that they were moved to.
+        moved: Atoms that were moved, by the site to which they were moved.
         kept: Atoms that stayed on their site.
         by_cycle: Moved and kept for each cycle, counted from 0 over all rearrangements of the shot.
         n_read: Number of shots.
@@ -243,7 +243,7 @@ class Survival:
         """Count the atoms of a shot.
 
         Args:
-            loads: Indices of the steps that load atoms; survival is not counted across them.
+            loads: Indices of the steps that load atoms. Survival is not counted across them.
 
         Raises:
             RecordingError: The file cannot be read.
@@ -252,7 +252,7 @@ class Survival:
         loaded_s = [timing.t_start_s for timing in shot.timing if timing.step in loads]
         if len(images) != len(occupancies):
             raise RecordingError(
-                shot.file, "has other images than the index says", "restore it from a backup"
+                shot.file, "does not have the images that the index lists", "restore it from a backup"
             )
         number = -1  # of the cycle, over all rearrangements of the shot
         for i, ended_cycle in enumerate(images.cycle):

@@ -21,14 +21,14 @@ ORDER: Final = (
     *("load", "arm", "expose", "read_out", "detect", "plan", "check"),
     *("tones", "render", "upload", "prepare", "start", "light", "rest", "play", "move", "write"),
 )
-"""The stages of a shot in order; unknown ones come last."""
+"""The stages of a shot in order. Unknown stages come last."""
 WRITE: Final = "write"
-"""Stage of encoding a shot, and of writing its file and its line in the index."""
+"""Stage of encoding a shot, and writing its file and its line in the index."""
 
 
 @dataclass(frozen=True, slots=True)
 class Quantiles:
-    """Median and 99th percentile; NaN without values."""
+    """Median and 99th percentile. NaN without values."""
 
     p50: float
     p99: float
@@ -39,13 +39,13 @@ class StageStatistics:
     """Durations of a stage over many shots.
 
     Attributes:
-        stage: Its name: "expose", "plan", ..., "write", or "step_2_rearrange" for a whole step.
+        stage: Name of the stage, such as "expose", "plan" or "write", or "step_2_rearrange" for a whole step.
         n: Number of times that it was recorded.
         n_per_shot: Mean number of times in a shot.
-        budget_s: Median budget; that of "play" is the length of each program; NaN without one.
-        session_s: Median and 99th percentile on the session's clock: modelled in a simulated run.
-        host_s: The same on this computer's clock.
-        share: Its share of the time of a shot, on the session's clock; writing is in addition to this time.
+        budget_s: Median budget. For "play" this is the length of each program. NaN without a budget.
+        session_s: Median and 99th percentile on the session's clock, which is modelled in a simulated run.
+        host_s: Median and 99th percentile on this computer's clock.
+        share: Its share of the time of a shot, on the session's clock. Writing is in addition to this time.
         n_over: Number of times that it exceeded its budget.
     """
 
@@ -64,11 +64,11 @@ class RunTiming:
     """The stages of a run's shots.
 
     Attributes:
-        n_shots: Shots of the run.
-        simulated: Whether the run was simulated: the session's clock is then that of the models.
-        n_read: Shots whose files were read.
+        n_shots: Number of shots of the run.
+        simulated: Whether the run was simulated. The session's clock then runs on modelled time.
+        n_read: Number of shots whose files were read.
         shot_s: Median and 99th percentile of the steps of a shot together, on the session's clock.
-        stages: The stages, in the order of a shot; whole steps last.
+        stages: The stages in the order of a shot, with whole steps last.
     """
 
     n_shots: int
@@ -97,11 +97,11 @@ class StageTotals:
         """Add the stages of a shot that has been read."""
         for stage in timing:
             self._timings.setdefault(stage.stage, []).append(stage)
-        # whole steps only: stages are within steps, and some at the same time as others
+        # whole steps only, because stages are within steps, and some overlap with others
         self._shot_s.append(math.fsum(stage.duration_s for stage in timing if stage.stage.startswith(STEP)))
 
     def stages(self) -> list[StageStatistics]:
-        """The statistics of all stages added so far, without that of writing."""
+        """The statistics of all stages added so far, without the stage of writing."""
         n_read, total_s = len(self._shot_s), math.fsum(self._shot_s)
         names = sorted(self._timings, key=_place)
         return [_sum_up(name, self._timings[name], n_read, total_s) for name in names]
@@ -122,7 +122,7 @@ class StageTotals:
 
 
 def timing_of(run: Run, shots: Iterable[Shot]) -> RunTiming:
-    """Durations of the stages of the given shots; those whose files cannot be read are left out."""
+    """Durations of the stages of the given shots. Shots whose files cannot be read are left out."""
     totals = StageTotals()
     for shot in shots:
         with suppress(RecordingError):
@@ -132,7 +132,7 @@ def timing_of(run: Run, shots: Iterable[Shot]) -> RunTiming:
 
 def _place(name: str) -> tuple[bool, int, str]:
     """Sorting key: known stages in their order, then others, then whole steps."""
-    # plugins may report stages of their own
+    # plugins may report their own stages
     return name.startswith(STEP), ORDER.index(name) if name in ORDER else len(ORDER), name
 
 
@@ -180,7 +180,7 @@ def writing_s(run: Run) -> list[float]:
 
 
 def quantiles(values: Sequence[float] | NDArray[np.float64]) -> Quantiles:
-    """Median and 99th percentile, interpolated; NaN without values.
+    """Median and 99th percentile, interpolated. NaN without values.
 
     Example:
         >>> quantiles([1.0, 2.0, 3.0]).p50

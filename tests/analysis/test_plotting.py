@@ -67,7 +67,7 @@ def test_each_picture_has_a_name_of_its_own(
         (PlotRequest(), "a.bmp", "not the name of a PNG or SVG or PDF file"),
         (PlotRequest(what="scan"), "a.png", "nothing to show of the scan; expected a run of a sequence with"),
         (PlotRequest(shot=1, what="scan"), "a.png", "--what and --shot: these are different pictures"),
-        (PlotRequest(cycle=1), "a.png", "--cycle: a cycle belongs to a shot; expected --shot as well"),
+        (PlotRequest(cycle=1), "a.png", "--cycle: a cycle needs a shot; expected --shot as well"),
     ],
 )
 def test_what_cannot_be_drawn_is_reported(

@@ -193,7 +193,7 @@ def test_the_commands_show_write_and_draw_the_same_points(
     assert len(rest) == 5
     (tmp_path / "scan.png").touch()
     assert printed("plot", run, *scan, "--fit", "exponential") == "written: scan_1.png\n"
-    assert "this file exists already; expected a new name; --force replaces it" in printed(
+    assert "this file already exists; expected a new name; --force replaces it" in printed(
         "plot", run, *scan, "-o", "scan.png"
     )
     assert (tmp_path / "scan.png").stat().st_size == 0

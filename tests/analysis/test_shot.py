@@ -77,7 +77,7 @@ def test_a_cycle_is_the_image_before_and_the_one_after_it(write: Write) -> None:
 def test_frames_of_another_size_than_the_sites_are_left_out(write: Write) -> None:
     drawing = shot_picture(write([make_shot(0, kept=True)]), 0)
     assert drawing.sites_px is None
-    assert drawing.note.endswith("no frames: their size is not that of the sites")
+    assert drawing.note.endswith("no frames: their size does not fit the sites")
 
 
 def test_an_interrupted_shot_is_shown_as_far_as_it_came(write: Write) -> None:
@@ -92,8 +92,8 @@ def test_an_interrupted_shot_is_shown_as_far_as_it_came(write: Write) -> None:
 @pytest.mark.parametrize(
     ("index", "cycle", "reported"),
     [
-        (2, None, "--shot: the run has no shot 2; expected one from 0 to 1"),
-        (0, 1, "has no cycle 1; expected one from 0 to 0"),
+        (2, None, "--shot: the run has no shot 2; expected a shot from 0 to 1"),
+        (0, 1, "has no cycle 1; expected a cycle from 0 to 0"),
         (1, 0, "has no cycle 0; expected a shot that rearranges"),
     ],
 )
@@ -112,7 +112,7 @@ def test_a_cycle_of_a_recorded_shot_is_animated(compact: Run, tmp_path: Path) ->
     assert len(json.loads(scene[1])["batches"]) == cycle.n_batches_played
     for number, reported in (
         (None, r"shot 1 has \d+ cycles.*expected --cycle with a number from 0 to"),
-        (99, "has no cycle 99; expected one from 0 to"),
+        (99, "has no cycle 99; expected a cycle from 0 to"),
     ):
         with pytest.raises(ConfigError, match=reported):
             plot_run(compact.path, PlotRequest(shot=1, cycle=number), tmp_path / "other.gif")

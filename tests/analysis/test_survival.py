@@ -71,5 +71,5 @@ def test_atoms_are_not_followed_through_a_load(
 def test_a_file_that_is_not_what_the_index_tells_of_is_damaged(write: Write) -> None:
     run = write([make_shot(0), make_shot(1, n_cycles=2)])
     run.shots[0].file.write_bytes(run.shots[1].file.read_bytes())
-    with pytest.raises(RecordingError, match="has other images than the index says"):
+    with pytest.raises(RecordingError, match="does not have the images that the index lists"):
         counted(run)

@@ -118,7 +118,7 @@ def test_an_analysis_is_made_up_and_reported(run, capsys):
     path = run.path / "analysis" / "survival.jsonl"
     assert capsys.readouterr().out == f"survival: 2 shots analysed; see {path}\n"
     assert analyse_run(run.path, "survival", ["atoms=moved"], again=False) == 0
-    assert "0 shots analysed, 2 had a result already" in capsys.readouterr().out
+    assert "0 shots analysed, 2 already had a result" in capsys.readouterr().out
 
 
 def test_quantities_need_neither_analysis_nor_scan(run, capsys):
