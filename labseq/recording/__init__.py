@@ -1,4 +1,4 @@
-"""Writes the folder of a run, with one HDF5 file per shot; one schema, which readers follow."""
+"""Writes the folder of a run, with one HDF5 file per shot, according to one schema that readers share."""
 
 from labseq.files import data_root
 from labseq.recording.markers import (

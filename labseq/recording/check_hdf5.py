@@ -1,7 +1,7 @@
-"""Checks a shot's file before anything is read of it: links, sizes, types, and the shapes of its arrays.
+"""Checks a shot's file before any value is read: links, sizes, types, and the shapes of its arrays.
 
-A file that labseq did not write may be made to do harm, and :func:`check_file` is the one place that looks
-for that. What the numbers mean is checked where they become records.
+A file that labseq did not write may be made to do harm. Only :func:`check_file` looks for that. The meaning
+of the numbers is checked where they become records.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ MAX_DEPTH: Final = 8
 """Deepest group in a shot's file."""
 
 MAX_ATTRIBUTES: Final = 100
-"""Largest number of attributes of an object; the time that HDF5 takes to read them grows with its square."""
+"""Largest number of attributes of an object. The time to read them grows with its square."""
 
 _FILTERS: Final = frozenset({1, 2, 3, 32000, 32001, 32004, 32008, 32015, 32026})
 """deflate, shuffle, fletcher32, LZF, Blosc, LZ4, bitshuffle, Zstd, Blosc2.
 
-HDF5 loads a library for any other, which a hostile file could name.
+HDF5 loads a library for any other filter, which a hostile file could name.
 """
 
 _checked: Final[dict[tuple[object, str], None]] = {}
-"""Files that were right, each with the part that was checked: the latest thousand."""
+"""Files that passed the check, each with the part that was checked. The latest thousand are kept."""
 
 
 class _Expected(NamedTuple):
-    """What the schema says of a dataset.
+    """The axes and types that the schema gives a dataset.
 
     Attributes:
         axes: Names of its axes.
-        kinds: Column, "" for an array, -> kind of its numbers as numpy names it.
+        kinds: Column, or "" for an array -> kind of its numbers, as numpy names it.
     """
 
     axes: Sequence[str]
@@ -63,16 +63,16 @@ _EXPECTED: Final = {
 def check_file(file: Any, path: Path, only: str = "") -> None:
     """Refuse a shot's file that leads elsewhere, declares too much, or has arrays of wrong types or shapes.
 
-    A file that has not changed since is not checked again.
+    A file that has not changed since it was checked is not checked again.
 
     Args:
-        file: The file, opened; nothing but its structure is read.
+        file: The opened file. Only its structure is read.
         path: Its path.
-        only: The one dataset or group that will be read, such as "/entry/detection"; "" for all.
+        only: The one dataset or group that will be read, such as "/entry/detection". "" for all.
 
     Raises:
-        ValueError: It has links to other files, an object twice, data in other files, unknown filters,
-            types or objects, declares more data than it has, or does not follow the schema; says where.
+        ValueError: The file links to other files or has data there, contains an object twice, has unknown
+            filters, types or objects, declares more data than it has, or violates the schema.
     """
     status = path.stat()
     stamp = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
@@ -103,7 +103,7 @@ def _check_contents(file: Any, n_bytes: int, only: str) -> None:
             if kind != h5l.TYPE_HARD:
                 raise ValueError(f"{place} is a link that leads elsewhere")
             node = h5o.open(group, name)
-            if h5o.get_info(node).rc > 1:  # groups that contain each other would have no end
+            if h5o.get_info(node).rc > 1:  # groups that contain each other would never end
                 raise ValueError(f"{place} is in the file twice")
             if h5a.get_num_attrs(node) > MAX_ATTRIBUTES:
                 raise ValueError(f"{place} has more than {MAX_ATTRIBUTES} attributes")
@@ -114,23 +114,23 @@ def _check_contents(file: Any, n_bytes: int, only: str) -> None:
             else:
                 raise ValueError(f"{place} is neither a group nor a dataset")  # noqa: TRY004 - of the file
     if n_declared > n_bytes:
-        raise ValueError(f"its datasets declare {n_declared} bytes, and the file has {n_bytes}")
+        raise ValueError(f"its datasets declare {n_declared} bytes, but the file has {n_bytes}")
 
 
 def _check_dataset(dataset: Any, place: str, n_bytes: int, lengths: dict[str, int]) -> int:
     """Check a dataset.
 
     Args:
-        dataset: The dataset, opened.
+        dataset: The opened dataset.
         place: Its path in the file.
         n_bytes: Size of the file.
-        lengths: Axis -> its length in the datasets before; new ones are added.
+        lengths: Axis -> its length in earlier datasets. New axes are added.
 
     Returns:
-        Bytes that it declares; 0 if it is compressed, because its size is checked here.
+        Bytes that it declares. 0 if it is compressed, because its size is checked here.
 
     Raises:
-        ValueError: Its data are not in the file, are more than it can hold, or do not follow the schema.
+        ValueError: Its data are not in the file, are more than the file can hold, or violate the schema.
     """
     kind, shape = dataset.get_type(), dataset.get_space().get_simple_extent_dims()
     plist = dataset.get_create_plist()
@@ -143,10 +143,10 @@ def _check_dataset(dataset: Any, place: str, n_bytes: int, lengths: dict[str, in
     filters = {plist.get_filter(i)[0] for i in range(plist.get_nfilters())}
     if not filters <= _FILTERS:
         raise ValueError(f"{place} has the filter {min(filters - _FILTERS)}, which labseq does not use")
-    # frames shrink by less than 64; a dataset of up to 16 MiB may be as empty as it likes
+    # frames compress by less than a factor of 64, and a dataset of up to 16 MiB may be as empty as it likes
     limit = max(1 << 24, 64 * n_bytes) if filters else n_bytes
     if size > limit:
-        raise ValueError(f"{place} declares {size} bytes, and the file has {n_bytes}")
+        raise ValueError(f"{place} declares {size} bytes, but the file has {n_bytes}")
     camera = re.match(r"/entry/camera/[^/]+/", place)
     schema_path = place.replace(camera[0], "camera/<name>/") if camera else place.removeprefix("/entry/")
     if (expected := _EXPECTED.get(schema_path)) is not None:
@@ -162,7 +162,7 @@ def _check_shape(
     if len(shape) != len(axes):
         raise ValueError(f"{place} has the shape {shape}; expected ({', '.join(axes)})")
     for axis, length in zip(axes, shape, strict=True):
-        known = lengths.setdefault(camera + axis, length)  # each camera has a number of frames of its own
+        known = lengths.setdefault(camera + axis, length)  # each camera has its own number of frames
         if known != length:
             raise ValueError(f"{place} has the length {length} along '{axis}'; expected {known}")
 
@@ -173,16 +173,17 @@ _KIND_OF: Final = {h5t.TypeIntegerID: "i", h5t.TypeFloatID: "f", h5t.TypeStringI
 def check_type(kind: Any, place: str, expected: Mapping[str, str] | None = None, name: str = "") -> None:
     """Refuse types that labseq does not use.
 
-    References and sequences lead elsewhere in the file, or to the same place many times. Texts of variable
-    length are read by HDF5 without an end if the part of the file that holds them is damaged.
+    References and sequences lead elsewhere in the file, or to the same place many times. If the part of the
+    file that holds texts of variable length is damaged, HDF5 reads them without end.
 
     Args:
         kind: The type.
-        place: Where it is, for the message.
-        expected: Column, "" for an array, -> kind of its numbers; others may have any.
+        place: Its place in the file, for the message.
+        expected: Column, or "" for an array -> kind of its numbers. Other columns may have any kind.
         name: The column.
 
     Raises:
+        ValueError: The type is not allowed.
         ValueError: It is another type.
     """
     if isinstance(kind, h5t.TypeCompoundID):

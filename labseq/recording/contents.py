@@ -32,7 +32,7 @@ def _kind(field: Field) -> str:
     return {"json": "JSON text", "integer": "int64 or text"}.get(field.dtype, field.dtype)
 
 
-_VIEWER: Final = ("text", "for viewers: class, signal, axes or default plot after NeXus")
+_VIEWER: Final = ("text", "class, signal, axes or default plot for viewers (NeXus)")
 
 
 def attributes() -> dict[str, dict[str, tuple[str, str]]]:
@@ -49,7 +49,7 @@ def attributes() -> dict[str, dict[str, tuple[str, str]]]:
     }
     root = {
         "format": ("text", FORMAT),
-        "format_version": ("text", "major.minor; a newer minor version only adds things"),
+        "format_version": ("text", "major.minor, a newer minor version only adds values"),
         "creator": ("text", "labseq and its version"),
     }
     by_path = {"/": root | dict.fromkeys(("NX_class", "default"), _VIEWER)}
@@ -64,11 +64,11 @@ def attributes() -> dict[str, dict[str, tuple[str, str]]]:
 
 
 EVERYWHERE: Final[Mapping[str, str]] = {
-    "units": "unit of the numbers, SI, px, adu or the detector's, empty for none; of a table that of each "
-    "column",
-    "dimensions": "arrays only: names of the axes",
+    "units": "unit of the numbers, SI, px, adu or the detector's, empty for none, one for each column of a "
+    "table",
+    "dimensions": "names of the axes, for arrays only",
     "description": "what the dataset is",
-    "descriptions": "tables only: what each column is",
-    "content_type": "texts only: application/json or text/plain",
+    "descriptions": "what each column is, for tables only",
+    "content_type": "application/json or text/plain, for texts only",
 }
 """Attributes of every dataset."""

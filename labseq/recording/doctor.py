@@ -1,7 +1,7 @@
 """`labseq doctor`: finds and repairs damage in recorded data.
 
-Nothing is deleted: files that do not belong are moved to the folder ``quarantine`` of their run, and
-``doctor.jsonl`` there records when, why and from where.
+Nothing is deleted. Files that do not belong are moved to the folder ``quarantine`` of their run, where
+``doctor.jsonl`` records when, why and from where.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ QUARANTINE: Final = "quarantine"
 _TO_QUARANTINE: Final = "moved to quarantine"
 _CHECK_PERMISSIONS: Final = "left: check its permissions and the disk"
 _MAX_FINDINGS: Final = 100
-"""Damaged lines of a file that are reported one by one."""
+"""Maximum number of damaged lines of a file that are reported one by one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A defect that was found, and what was done about it.
+    """A defect, and what was done about it.
 
     Attributes:
         what: The defect.
         where: The damaged file or folder.
-        done: The repair, or in a dry run the intended repair; or why it cannot be repaired.
+        done: The repair, or the intended repair in a dry run, or why it cannot be repaired.
         left: Whether the defect remains.
     """
 
@@ -68,11 +68,11 @@ class Report:
     """The result of looking for damage.
 
     Attributes:
-        findings: In the order they were found.
-        n_runs: Runs that were checked.
+        findings: Defects in the order in which they were found.
+        n_runs: Number of runs that were checked.
         n_shots: Number of their intact shots.
-        in_progress: Runs that were left alone because they are in progress, here or on another computer.
-        n_in_use: Number of the intact shots that another program has open for writing.
+        in_progress: Runs that were skipped because they are in progress, here or on another computer.
+        n_in_use: Number of intact shots that another program has open for writing.
     """
 
     findings: list[Finding] = field(default_factory=list[Finding])
@@ -85,11 +85,11 @@ class Report:
 def examine(path: Path, *, dry_run: bool = False) -> Report:
     """Look for damage in a data folder or in one run, and repair what can be repaired.
 
-    Runs in progress are left alone.
+    Runs in progress are skipped.
 
     Args:
-        path: The data folder, a day of it, or a run's folder.
-        dry_run: Whether to change nothing.
+        path: The data folder, the folder of a day, or a run's folder.
+        dry_run: True to change nothing.
 
     Raises:
         RecordingError: The folder cannot be read.
@@ -98,7 +98,7 @@ def examine(path: Path, *, dry_run: bool = False) -> Report:
     all_markers = markers()
     active = {marker.run_dir for marker in all_markers if marker.is_active}
     for run_dir in _runs(root, report):
-        # run.json comes last when a folder is made
+        # run.json is written last when a folder is created
         is_being_made = not _may_exist(run_dir / folders.RUN_FILE) and _is_young(run_dir)
         if run_dir.resolve() in active or is_being_made:
             report.in_progress.append(run_dir)
@@ -112,7 +112,7 @@ def examine(path: Path, *, dry_run: bool = False) -> Report:
 
 
 def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
-    """Check a run, and repair it under its lock, so that no process resumes it meanwhile."""
+    """Check a run and repair it under its lock, so that no process resumes it meanwhile."""
     if _is_in_progress(run_dir):
         report.in_progress.append(run_dir)
         return
@@ -122,12 +122,12 @@ def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
         lock = Lock(run_dir / folders.LOCK_FILE, "labseq doctor")
         try:
             is_locked = False
-            with suppress(OSError):  # the folder has no locks, or may not be written: the repairs report it
+            with suppress(OSError):  # the repairs report a folder without locks or permission to write
                 is_locked = lock.take() is not None
             if is_locked or _is_in_progress(run_dir):
                 report.in_progress.append(run_dir)
                 return
-            check = _Check(run_dir, dry_run=False)  # again, as the run may have changed before it was locked
+            check = _Check(run_dir, dry_run=False)  # again, as it may have changed before it was locked
             check.check_run()
         finally:
             lock.release()
@@ -138,7 +138,7 @@ def _examine_run(run_dir: Path, report: Report, *, dry_run: bool) -> None:
 
 
 def _is_in_progress(run_dir: Path) -> bool:
-    """Whether a process works on a run; for a run on another computer, as its folder says."""
+    """Whether a process works on a run. For a run on another computer, its folder tells."""
     state = read_state_file(run_dir)
     process = Process.from_plain(state)
     is_gone = process is None or (process.is_here and not process.is_running)
@@ -146,16 +146,16 @@ def _is_in_progress(run_dir: Path) -> bool:
 
 
 class _LineFile:
-    """A file of JSON lines, read for repair; it is written once, when everything is known.
+    """A file of JSON lines, read for repair and written once all changes are known.
 
     Attributes:
         path: The file.
-        rows: Number of a line, from 0 -> its JSON object; other lines are removed.
+        rows: Number of a line, from 0 -> its JSON object. Other lines are removed.
         added: Lines that are added at the end.
         problems: Each problem, its place, and its repair when the file is saved.
 
     Raises:
-        RecordingError: It cannot be read.
+        RecordingError: The file cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -181,7 +181,7 @@ class _LineFile:
                 self.remove([number], f"line {number + 1} is damaged")
 
     def remove(self, numbers: Collection[int], what: str = "") -> None:
-        """Remove lines; ``what`` is the reason, unless another finding reports it."""
+        """Remove lines. ``what`` is the reason, or "" if another finding reports it."""
         self._removed.update(numbers)
         if what:
             n_findings = len(numbers) if len(numbers) <= _MAX_FINDINGS else 1
@@ -191,7 +191,7 @@ class _LineFile:
         """Write the file if it changes.
 
         Raises:
-            RecordingError: It cannot be written; the old file is unchanged.
+            RecordingError: The file cannot be written. The old file is unchanged.
         """
         if self._removed:
             # to the quarantine first: if this is interrupted, a line is in both files, and none is lost
@@ -209,13 +209,13 @@ class _LineFile:
 
 
 class _Check:
-    """Checks one folder, and repairs it right away unless it is a dry run.
+    """Checks one folder, and repairs it at once unless it is a dry run.
 
     Attributes:
-        folder: The folder; files that do not belong are moved to its quarantine.
-        findings: In the order they were found.
+        folder: The folder. Files that do not belong are moved to its quarantine.
+        findings: Defects in the order in which they were found.
         n_whole: Number of intact shots.
-        n_in_use: Number of those that another program has open for writing.
+        n_in_use: Number of intact shots that another program has open for writing.
     """
 
     def __init__(self, folder: Path, *, dry_run: bool) -> None:
@@ -226,7 +226,7 @@ class _Check:
         self._dry_run = dry_run
 
     def check_run(self) -> None:
-        """Check everything in a run's folder; an unreadable part is left unchanged."""
+        """Check everything in a run's folder. An unreadable part is left unchanged."""
         shots, results = self.folder / folders.SHOTS_FOLDER, self.folder / folders.RESULTS_FOLDER
         try:
             if not (self.folder / folders.RUN_FILE).exists():
@@ -257,7 +257,7 @@ class _Check:
     def check_data_folder(self, stale: list[Marker]) -> None:
         """Check for leftovers in a data folder next to its runs."""
         for marker in stale:
-            # that of a run in another folder, often of another user, says nothing about this one
+            # a run in another folder, often of another user, says nothing about this one
             if marker.run_dir is None or not marker.run_dir.is_relative_to(self.folder.resolve()):
                 continue
             advice = f"'labseq safe {marker.profile or 'PROFILE'}', or the next run on it, makes it safe"
@@ -278,7 +278,7 @@ class _Check:
             remedy = "left as it is: restore it from a backup, then run this again"
             self._add(f"{folders.RUN_FILE} is missing", self.folder, remedy)
         else:
-            what = "the run died while its folder was made; it holds no shots"
+            what = "the run died while its folder was created and holds no shots"
             self._quarantine(what, self.folder, self.folder.parent)
 
     def _check_state(self) -> None:
@@ -307,27 +307,27 @@ class _Check:
             if row is not None and _is_name(row):
                 rows[number] = row
                 of_file.setdefault(row.file, []).append(number)
-        index.remove([*index.rows.keys() - rows.keys()], "a line of the index is not a shot's")
+        index.remove([*index.rows.keys() - rows.keys()], "a line of the index describes no shot")
         whole = {
             file for file, same in of_file.items() if self._check_file({n: rows[n] for n in same}, index)
         }
         self.n_whole += len(whole)
         intact = sorted(number for file in whole for number in of_file[file])
-        # of a shot that was written twice, the last line counts
+        # the last line of a shot that was written twice counts
         file_of = {rows[number].shot: rows[number].file for number in intact if rows[number].counts}
-        # later takes first: an earlier take of a shot must not get the line
+        # later takes first, because an earlier take of a shot must not get the line
         for name in sorted(names_in(folder), key=lambda name: (len(name), name), reverse=True):
             if SHOT_FILE.fullmatch(file := f"{folder.name}/{name}") and file not in of_file:
                 self._check_stray(folder / name, run_id, file_of, index)
         self._save(index)
 
     def _check_stray(self, path: Path, run_id: str, file_of: dict[int, str], index: _LineFile) -> None:
-        """Add a line for a shot's file that has none, unless the shot was taken again.
+        """Add a line for a shot's file without one, unless the shot was taken again.
 
         Args:
-            path: The file; later takes of a shot come before earlier ones.
-            run_id: The run's identity.
-            file_of: Shot -> the file that counts; the shot is added.
+            path: The file. Later takes of a shot come before earlier ones.
+            run_id: The run's id.
+            file_of: Shot -> the file that counts. The shot is added.
             index: The index.
         """
         row = self._row_of_stray(path, run_id)
@@ -342,10 +342,10 @@ class _Check:
         self.n_whole += 1
 
     def _check_file(self, rows: dict[int, IndexRow], index: _LineFile) -> bool:
-        """Whether the file of a shot exists unchanged; further lines of the index for it are removed.
+        """Whether the file of a shot exists unchanged. Superfluous lines of the index for it are removed.
 
         Args:
-            rows: The lines for the file, by their number.
+            rows: The lines for the file, by line number.
         """
         numbers, last = [*rows], [*rows.values()][-1]
         path = self.folder / last.file
@@ -382,7 +382,7 @@ class _Check:
         return True
 
     def _row_of_stray(self, path: Path, run_id: str) -> IndexRow | None:
-        """The line for a file that has none, if the file is a whole shot of this run."""
+        """The line for a file without one, if the file is an intact shot of this run."""
         from labseq.recording.shot_file import (  # h5py takes 0.1 s to import
             damage_reported,
             iter_frames,
@@ -392,7 +392,7 @@ class _Check:
         file = path.relative_to(self.folder).as_posix()
         try:
             content = read_content(path)
-            for _ in iter_frames(path):  # each must be readable
+            for _ in iter_frames(path):  # every frame must be readable
                 pass
             n_bytes, sha256, _ = digest_of(path)
             with damage_reported(path):
@@ -417,7 +417,7 @@ class _Check:
             self._quarantine(f"a shot of another run, {content.run_id}", path)
             return None
         if not _is_name(row):
-            self._quarantine("a shot under a name that is not its own", path)
+            self._quarantine("a shot under a wrong name", path)
             return None
         return row
 
@@ -434,12 +434,12 @@ class _Check:
             self.findings.append(Finding(what, where, error or remedy, left=self._dry_run or bool(error)))
 
     def _quarantine(self, what: str, path: Path, folder: Path | None = None) -> None:
-        """Move a file or folder to the quarantine of ``folder``, by default of the folder that is checked."""
+        """Move a file or folder to the quarantine of ``folder``. Default: the folder that is checked."""
         goal = self.folder if folder is None else folder
         self._add(what, path, _TO_QUARANTINE, lambda: _move_away(what, path, goal))
 
     def _add(self, what: str, where: Path, done: str, repair: Callable[[], None] | None = None) -> bool:
-        """Report a finding and repair it; returns whether it is repaired, or would be without a dry run."""
+        """Report and repair a finding. True if it is repaired, or would be without a dry run."""
         if repair is not None and not self._dry_run:
             try:
                 repair()
@@ -451,7 +451,7 @@ class _Check:
 
 
 def _is_locked(path: Path) -> bool:
-    """Whether a program holds HDF5's lock on a file; one that died has left only its mark."""
+    """Whether a program holds HDF5's lock on a file. A program that died has left only its mark."""
     try:
         import fcntl
     except ImportError:  # on Windows a file that is open cannot be moved anyway
@@ -498,10 +498,10 @@ def _quarantine_of(folder: Path) -> Path:
 
 
 def names_in(folder: Path) -> list[str]:
-    """The names in a folder, sorted; none where there is no such folder.
+    """The names in a folder, sorted. Empty if there is no such folder.
 
     Raises:
-        RecordingError: It cannot be read.
+        RecordingError: The folder cannot be read.
     """
     try:
         return sorted(entry.name for entry in folder.iterdir())
@@ -512,7 +512,7 @@ def names_in(folder: Path) -> list[str]:
 
 
 def _runs(root: Path, report: Report) -> Iterator[Path]:
-    """The folders of runs: the path itself, those in it, or those in its days."""
+    """The folders of runs: the path itself, runs in it, or runs in the folders of its days."""
     if _is_run(root):
         yield root
         return
@@ -537,7 +537,7 @@ def _is_run(folder: Path) -> bool:
     parts = (folders.RUN_FILE, folders.STATE_FILE, folders.INDEX_FILE, folders.SHOTS_FOLDER)
     if re.fullmatch(r"\d{4,}_.*", folder.name, re.DOTALL):
         return True
-    # renamed, or in no day's folder
+    # a renamed run, or a run outside the folder of a day
     return any(_may_exist(folder / name) for name in parts)
 
 
@@ -550,9 +550,9 @@ def _may_exist(path: Path) -> bool:
 
 
 def _is_young(path: Path) -> bool:
-    """Whether something may belong to a run that is just being created: it is less than a minute old."""
+    """Whether something is less than a minute old, and so may belong to a run that is being created."""
     try:
-        # of either sign, as the clock of a file server may be ahead
+        # of either sign, because the clock of a file server may be ahead
         return abs(time.time() - path.stat().st_mtime) < 60.0
     except OSError:
         return False

@@ -1,4 +1,4 @@
-"""Creates and finds a run's folder; names of the files in it."""
+"""Creates and finds a run's folder, and names the files in it."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ STATE_FILE: Final = "STATE"
 INDEX_FILE: Final = "index.jsonl"
 EVENTS_FILE: Final = "events.jsonl"
 SKIPPED_FILE: Final = "skipped.jsonl"
-"""Lists skipped shots with the reason; exists only if there are any."""
+"""Lists skipped shots with the reason. Exists only if there are any."""
 SEQUENCE_FILE: Final = "sequence.yaml"
 PROFILE_FILE: Final = "profile.yaml"
 SHOTS_FOLDER: Final = "shots"
 RESULTS_FOLDER: Final = "analysis"
-"""Results of analyses: a file of lines for each."""
+"""Results of analyses, with a file of lines for each analysis."""
 RESULT_PREFIX: Final = "analysis."
-"""Prefix of the names of results: "analysis.NAME.KEY"."""
+"""Prefix of the names of results, as in "analysis.NAME.KEY"."""
 STOP_FILE: Final = "STOP"
 """Exists while a request to end the run after the current shot is pending."""
 NOTIFY_FILE: Final = "notify.yaml"
-"""In the data folder: where notices of failures, alarms and the end of the queue are sent."""
+"""In the data folder: where to send notices of failures, alarms and the end of the queue."""
 NOTES_FILE: Final = "notes.json"
-"""Note and tags, see :mod:`labseq.recording.notes`; exists only if there are any."""
+"""Note and tags, see :mod:`labseq.recording.notes`. Exists only if there are any."""
 SOURCES_FILE: Final = "sources.zip"
 """The sources of the plugins that the run uses."""
 LOCK_FILE: Final = ".lock"
@@ -40,14 +40,14 @@ LOCK_FILE: Final = ".lock"
 UNLOGGED_EVENTS: Final[Mapping[str, str]] = {
     "image": SHOTS_FOLDER,
     "cycle": SHOTS_FOLDER,
-    "stage": SHOTS_FOLDER,  # one that exceeded its budget is logged as "over_budget"
+    "stage": SHOTS_FOLDER,  # a stage over its budget is logged as "over_budget"
     "state": "",
     "compiling": "",
     "compiled": "",
 }
-"""Events of a run that its event log leaves out -> where their content is; "" if nowhere."""
+"""Events of a run that its event log leaves out -> where their content is. "" if nowhere."""
 UNLOGGED_VALUES: Final[Mapping[str, str]] = {"record": RUN_FILE, "row": INDEX_FILE}
-"""The same for values of the events in it."""
+"""Values of logged events that the event log leaves out -> where their content is."""
 
 
 def slug(name: str) -> str:
@@ -64,7 +64,7 @@ def slug(name: str) -> str:
 
 
 def split_result(name: str) -> tuple[str, str] | None:
-    """The analysis and the key in the name of a result; None for the name of another quantity.
+    """The analysis and the key in the name of a result. None for the name of another quantity.
 
     Example:
         >>> split_result("analysis.losses.heating")
@@ -81,7 +81,7 @@ def shot_file_name(shot_index: int, attempt: int, *, counts: bool, take: int = 1
 
     Args:
         counts: Whether the attempt completed the shot.
-        take: Counted up from 1 in a resumed run that keeps the file of an earlier take.
+        take: Number from 1. A resumed run that keeps the file of an earlier take counts it up.
 
     Example:
         >>> shot_file_name(17, 1, counts=False)
@@ -95,10 +95,10 @@ def shot_file_name(shot_index: int, attempt: int, *, counts: bool, take: int = 1
 
 
 def make_run_folder(root: Path, name: str, started: datetime) -> Path:
-    """Create ``<root>/<local date>/<counter>_<slug>``; no two runs of a day share a counter.
+    """Create ``<root>/<local date>/<counter>_<slug>``. No two runs of a day share a counter.
 
-    A counter is claimed by making the folder ``.<counter>.claim``, which succeeds
-    for one process only. When the claim is removed, the run's folder exists.
+    A process claims a counter by creating the folder ``.<counter>.claim``, in which only one process
+    succeeds. When the claim is removed, the run's folder exists.
 
     Raises:
         RecordingError: The folder cannot be created.
@@ -130,7 +130,7 @@ def make_run_folder(root: Path, name: str, started: datetime) -> Path:
 
 
 def later_day(run_dir: Path) -> str:
-    """The last day in the data folder that has runs, if it is after that of this run; else ""."""
+    """The last day in the data folder with runs, if it is after the day of this run. Otherwise ""."""
     own_day, root = run_dir.parent.name, run_dir.parent.parent
     with contextlib.suppress(OSError):
         days = [
@@ -143,7 +143,7 @@ def later_day(run_dir: Path) -> str:
 
 
 def _counters(day: Path, *, claims: bool = True) -> list[int]:
-    """The numbers of a day's runs; with ``claims`` also those that a run is just taking."""
+    """The numbers of a day's runs. With ``claims``, also numbers that a run is just claiming."""
     names = (entry.name for entry in day.iterdir())
     matches = (re.match(r"\.?(\d{4,})[_.]", name) for name in names if claims or not name.startswith("."))
     return [int(match[1]) for match in matches if match]
@@ -153,11 +153,11 @@ def find_run(path: Path) -> Path:
     """Find the folder of a run.
 
     Args:
-        path: The folder or any file in it; or the name or number of a run, see
+        path: The folder, or any file in it, or the name or number of a run, see
             :func:`labseq.recording.listing.named_run`.
 
     Raises:
-        RecordingError: There is no such run; the message says what to give instead.
+        RecordingError: There is no such run. The message says what to give instead.
     """
     try:
         exists = is_there(path.expanduser())

@@ -1,6 +1,6 @@
-"""A run's index: a line of JSON per attempt at a shot, read back as an :class:`IndexRow`.
+"""A run's index, with one line of JSON per attempt at a shot, read back as an :class:`IndexRow`.
 
-A line also sums up the images and cycles of its shot, so that a run of many thousand shots is evaluated
+A line also sums up the images and cycles of its shot, so that a run of many thousand shots can be evaluated
 without opening their files.
 """
 
@@ -32,20 +32,20 @@ SIMULATION: Final = "simulation."
 """Prefix of the names of readings that only a simulation can know."""
 
 SHOT_FILE: Final = re.compile(SHOTS_FOLDER + r"/shot_\d{6,}(\.attempt_\d+)?(\.take_(\d+))?\.h5")
-"""A shot's file in a line of the index."""
+"""Path of a shot's file in a line of the index."""
 
 _OPEN_FOR_WRITING: Final = b"\1\0\0\0"
-"""What HDF5 writes after byte 20 of a file while a program has it open for writing, in place of zeros."""
+"""What HDF5 writes after byte 20 of a file instead of zeros while a program has it open for writing."""
 
 _T = TypeVar("_T")
 
 
 class ShotDigest(NamedTuple):
-    """What tells whether a shot's file is as it was written.
+    """Size and checksum of a shot's file, to tell whether it is as it was written.
 
     Attributes:
         n_bytes: Its size.
-        sha256: Its SHA-256 without HDF5's mark, in hexadecimal, as the index has it.
+        sha256: Its SHA-256 in hexadecimal without HDF5's mark, as in the index.
         is_marked: Whether a program has it open for writing, or had when it died.
     """
 
@@ -55,10 +55,10 @@ class ShotDigest(NamedTuple):
 
 
 def digest_of(path: Path) -> ShotDigest:
-    """Read a shot's file for its digest; a program that opens it for writing has not changed it by that.
+    """Read a shot's file for its digest. The mark of a program that opens it for writing is ignored.
 
     Raises:
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     with open_ordinary(path) as file:
         head = file.read(24)
@@ -74,12 +74,12 @@ class Images:
     """The images of a shot, in the order they were taken.
 
     Attributes:
-        cycle: Index of the cycle that each ended, within its step; -1 for that of an ``image`` step.
+        cycle: Index of the cycle that each image ended, within its step. -1 for an ``image`` step.
         t_start_s: Start of each exposure, from the start of the shot.
         exposure_s: Exposure times.
-        n_atoms: Atoms on each.
-        n_defects: Empty target sites on each.
-        n_surplus: Atoms on each on sites that must be empty.
+        n_atoms: Number of atoms on each image.
+        n_defects: Number of empty target sites on each image.
+        n_surplus: Number of atoms on each image on sites that must be empty.
     """
 
     cycle: Sequence[int] = ()
@@ -98,9 +98,9 @@ class Cycles:
     """The rearrangement cycles of a shot, in the order they were made.
 
     Attributes:
-        n_batches: Batches of each plan.
-        n_batches_played: Number of them that fitted into the window.
-        n_atom_moves: Atom moves in those that were played.
+        n_batches: Number of batches of each plan.
+        n_batches_played: Number of batches that fitted into the window.
+        n_atom_moves: Number of atom moves in the batches that were played.
     """
 
     n_batches: Sequence[int] = ()
@@ -115,19 +115,19 @@ class Cycles:
 class IndexRow:
     """An attempt at a shot, as the index lists it.
 
-    Its first attributes are those of :data:`labseq.recording.schema.IN_INDEX`, which describes them.
+    Its first attributes are described in :data:`labseq.recording.schema.IN_INDEX`.
 
     Attributes:
-        counts: Whether it is the shot: false for an attempt that failed or was interrupted.
-        stage_s: Stage -> sum of its durations on the session's clock; a step as "step_0_load".
-        parameters: Settings that differ from the files: address -> value; scanned ones in SI.
+        counts: Whether it is the shot. False for an attempt that failed or was interrupted.
+        stage_s: Stage -> sum of its durations on the session's clock. A step is named like "step_0_load".
+        parameters: Settings that differ from the files: address -> value, scanned values in SI.
         readings: Single values read from devices, by dotted name.
         calibrations: The calibrations in use: kind -> id.
         images: Its images.
         cycles: Its rearrangement cycles.
-        simulation: True values that a simulation reported, such as "lost.vacuum"; empty on real hardware.
-        measured: What the run measures, as far as images tell it: name -> events and trials; those of other
-            quantities are in the columns.
+        simulation: True values that a simulation reported, such as "lost.vacuum". Empty on real hardware.
+        measured: What the run measures, if images tell it: name -> events and trials. Other quantities are
+            in the columns.
         file: The shot's file, from the run's folder.
         sha256: Checksum of the file.
         bytes: Size of the file.
@@ -162,7 +162,7 @@ class IndexRow:
 
     @property
     def duration_s(self) -> float:
-        """Sum of the steps on the session's clock, in seconds; nan if no step has ended."""
+        """Sum of the steps on the session's clock, in seconds. nan if no step has ended."""
         steps_s = [s for name, s in self.stage_s.items() if name.startswith(STEP) and not math.isnan(s)]
         return math.fsum(steps_s) if steps_s else math.nan
 
@@ -173,7 +173,7 @@ class IndexRow:
 
     @property
     def ends_with_image_step(self) -> bool:
-        """Whether the last image is not that of a cycle, whose result may have ended the rearrangement."""
+        """Whether the last image is from an ``image`` step, not from a cycle that may have ended early."""
         return all(cycle < 0 for cycle in self.images.cycle[-1:])
 
 
@@ -186,16 +186,16 @@ def row_of_record(
     n_bytes: int,
     measured: Iterable[str] = (),
 ) -> IndexRow:
-    """A shot as the index lists it: the same as when its line is read back.
+    """A shot as the index lists it, the same as when its line is read back.
 
-    A scanner thus chooses the same points, whether the run was resumed or not.
+    A scanner thus chooses the same points in a resumed run as in an uninterrupted one.
 
     Args:
         shot: The shot.
         target: The target of the run.
         file: Its file, from the run's folder.
-        sha256: Checksum of that.
-        n_bytes: Size of that.
+        sha256: Checksum of the file.
+        n_bytes: Size of the file.
         measured: The quantities that the run measures.
 
     Raises:
@@ -230,7 +230,7 @@ def row_of_record(
         "sha256": sha256,
         "bytes": n_bytes,
     }
-    row = row_of_line(to_plain(values))  # as it is read back: JSON has neither tuples nor infinities
+    row = row_of_line(to_plain(values))  # as it is read back, because JSON has neither tuples nor infinities
     if row is None:
         raise RecordingError(
             file, f"cannot be listed in {INDEX_FILE}", "a value of the shot has another type"
@@ -251,7 +251,7 @@ def _images(shot: ShotRecord, target: TargetPattern) -> dict[str, list[Any]]:
 
 
 def flat_readings(readings: Mapping[str, Any]) -> dict[str, Any]:
-    """The readings that are single values, by dotted name, except those of a simulation.
+    """The readings that are single values, by dotted name, without readings of a simulation.
 
     Example:
         >>> flat_readings({"laser": {"power_w": 0.1, "trace": [1, 2]}, "simulation.lost.vacuum": 2.0})
@@ -270,10 +270,10 @@ def _flat(prefix: str, values: Mapping[str, Any], depth: int) -> Iterator[tuple[
 
 
 def read_index(folder: Path) -> tuple[list[IndexRow], int]:
-    """The lines of a run's index, and the number of damaged ones, which are left out.
+    """The lines of a run's index, and the number of damaged lines, which are left out.
 
     Raises:
-        RecordingError: It exists but cannot be read.
+        RecordingError: The index exists but cannot be read.
     """
     lines = NewLines(folder / INDEX_FILE).placed()
     rows = [None if values is None else row_of_line(values) for _, values in lines]
@@ -282,9 +282,9 @@ def read_index(folder: Path) -> tuple[list[IndexRow], int]:
 
 
 def row_of_line(line: Mapping[str, Any]) -> IndexRow | None:
-    """The row in a line of the index; None if the line is damaged."""
+    """The row in a line of the index. None if the line is damaged."""
     try:
-        line = {"measured": {}, **line}  # those of earlier versions have none
+        line = {"measured": {}, **line}  # lines of earlier versions have none
         values: list[Any] = [read(line[name]) for name, read in _READ]
         return IndexRow(*values)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
@@ -301,19 +301,19 @@ def _of_type(*types: type) -> Callable[[Any], Any]:
 
 
 def _integer(value: Any) -> int:
-    """An integer that fits into a column of numpy, and not a bool."""
+    """An integer, not a bool, that fits into a column of numpy."""
     if type(value) is not int or not -(2**63) <= value < 2**63:
         raise TypeError(value)
     return value
 
 
 def _float(value: Any) -> float:
-    """A number; JSON has null for nan and infinities."""
+    """A number. JSON has null for nan and infinities."""
     return _floats([value])[0]
 
 
 def _integers(values: Iterable[Any]) -> Sequence[int]:
-    return array("q", values)  # eight bytes a number: an index may have many thousand lines
+    return array("q", values)  # eight bytes a number, as an index may have many thousand lines
 
 
 def _floats(values: Iterable[Any]) -> Sequence[float]:
@@ -329,7 +329,7 @@ def _events_by_name(values: Mapping[str, Any]) -> Mapping[str, Events]:
 
 
 def _table(kind: Callable[..., _T]) -> Callable[[Any], _T]:
-    """Reads columns of equal length."""
+    """Make a reader for columns of equal length."""
     columns = [
         (name, _integers if hint == Sequence[int] else _floats) for name, hint in get_type_hints(kind).items()
     ]

@@ -1,4 +1,4 @@
-"""The runs in a data folder, and the names by which users call them."""
+"""The runs in a data folder, and the names by which users refer to them."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from labseq.recording.folders import RUN_FILE, SHOTS_FOLDER, STATE_FILE
 
 
 def runs_in(root: Path) -> list[Path]:
-    """The folders of runs in a data folder, damaged ones included, the newest last."""
+    """The folders of runs in a data folder, including damaged ones, the newest last."""
     return [root / day / name for day, name in newest_first(root)][::-1]
 
 
 def newest_first(root: Path) -> Iterator[tuple[str, str]]:
-    """The same as day and name, the newest first; an older day is read when it is its turn.
+    """Day and name of the runs in a data folder, the newest first. An older day is read only when needed.
 
-    As text, since ten thousand paths take longer to make than all the rest.
+    They are text because making ten thousand paths takes longer than all the rest.
     """
     for day in sorted(_folders(root), reverse=True):
         if day.count("-") >= 2:
@@ -38,20 +38,20 @@ def _folders(folder: Path) -> list[str]:
 
 
 def counter_of(name: str) -> int:
-    """The number of a run, from the name of its folder; -1 if it has none."""
+    """The number of a run, from the name of its folder. -1 if it has none."""
     number = name.partition("_")[0]
     return int(number) if number.isdecimal() else -1
 
 
 def named_run(name: str, root: Path) -> Path:
-    """The newest run of a name or number, of which a part will do.
+    """The newest run with a name or number, which may be given in part.
 
     Args:
         name: "2026-11-20/0001_compact-225", "2026-11-20/1", "0001_compact-225", "compact-225" or "1".
         root: The data folder.
 
     Raises:
-        RecordingError: There is none.
+        RecordingError: There is no such run.
     """
     day, _, last = name.rpartition("/")
     for its_day, its_name in newest_first(root):
@@ -63,10 +63,10 @@ def named_run(name: str, root: Path) -> Path:
 
 
 def newest_run(root: Path) -> Path:
-    """The folder of the run that was started last: newest day, highest counter.
+    """The folder of the run that was started last, with the newest day and the highest counter.
 
     Raises:
-        RecordingError: There is none.
+        RecordingError: There are no runs.
     """
     for day, name in newest_first(root):
         if (root / day / name / RUN_FILE).exists():
@@ -75,7 +75,7 @@ def newest_run(root: Path) -> Path:
 
 
 def not_a_run(path: Path) -> RecordingError:
-    """The error of a path that exists and is not part of a run, which says what to give instead."""
+    """The error for a path that exists but is not part of a run. It says what to give instead."""
     for folder in (path, path.parent, path.parent.parent):
         if (folder / STATE_FILE).is_file():
             return RecordingError(folder, _without_run_file(folder))
@@ -90,5 +90,5 @@ def not_a_run(path: Path) -> RecordingError:
 
 def _without_run_file(folder: Path) -> str:
     if any((folder / SHOTS_FOLDER).glob("*.h5")):
-        return f"holds shots, but its {RUN_FILE} is gone; restore that from a backup"
-    return f"has no {RUN_FILE}: the run died while its folder was made; it holds no shots, delete it"
+        return f"holds shots, but its {RUN_FILE} is gone; restore it from a backup"
+    return f"has no {RUN_FILE}: the run died while its folder was created; delete it, as it holds no shots"

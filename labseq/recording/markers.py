@@ -1,8 +1,8 @@
 """Devices in use on this computer: the locks of their processes, and the markers of runs in progress.
 
-They belong to the hardware (see ``Settings.identities``), not to the profile's path or the data's folder: one
+They belong to the hardware (see ``Settings.identities``), not to the profile's path or the data folder. One
 folder per computer holds them, see :func:`labseq.files.devices_root`. A lock ends with its process. A marker
-exists from before the devices are opened until they are safe: if its process is gone, the run died.
+exists from before the devices are opened until they are safe. If its process is gone, the run died.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class Marker:
 
     Attributes:
         path: The file.
-        owner: The process; None if the file cannot be read.
-        run_dir: The run's folder; None if the file cannot be read.
-        profile: Key of the profile; "" if the file cannot be read.
+        owner: The process. None if the file cannot be read.
+        run_dir: The run's folder. None if the file cannot be read.
+        profile: Key of the profile. "" if the file cannot be read.
         hardware: Identities of the devices that may be on.
     """
 
@@ -46,11 +46,11 @@ class Marker:
 
     @property
     def is_active(self) -> bool:
-        """Whether its process runs."""
+        """Whether its process is running."""
         return self.owner is not None and self.owner.is_here and self.owner.is_running
 
     def concerns(self, profile: str, hardware: Collection[str]) -> bool:
-        """Whether it is of this profile or shares a device with it; true of one that cannot be read."""
+        """Whether it is of this profile or shares a device with it. True if the marker cannot be read."""
         return self.owner is None or self.profile == profile or not self.hardware.isdisjoint(hardware)
 
 
@@ -74,12 +74,12 @@ def mark_active(profile: str, hardware: Collection[str], run_dir: Path) -> None:
 
 
 def clear_active(profile: str, hardware: Collection[str]) -> None:
-    """Remove this process's marker, and the devices that are now safe from the markers of runs that died.
+    """Remove this process's marker, and remove devices that are now safe from the markers of dead runs.
 
-    Markers of other running processes stay, and so do those of dead runs with other devices.
+    Markers of other running processes stay, and so do markers of dead runs with other devices.
 
     Raises:
-        RecordingError: A marker cannot be changed; all others are.
+        RecordingError: A marker cannot be changed. All others are.
     """
     failures: list[RecordingError] = []
     for marker in markers():
@@ -103,16 +103,16 @@ def _remove(marker: Marker, devices: frozenset[str]) -> None:
         return
     try:
         marker.path.unlink(missing_ok=True)
-    except PermissionError:  # another user's: its folder lets only that user delete it
+    except PermissionError:  # in this folder only its own user can delete it
         write_shared(marker.path, _CLEARED)
     sync_folder(marker.path.parent)
 
 
 def find_dead_run(profile: str, hardware: Collection[str]) -> Path | None:
-    """Find a run whose process died before it made these devices safe; None if there is none.
+    """Find a run whose process died before it made these devices safe. None if there is none.
 
     Returns:
-        Its folder, or the marker itself if that cannot be read.
+        The run's folder, or the marker itself if it cannot be read.
     """
     for marker in markers():
         if not marker.is_active and marker.concerns(profile, hardware):
@@ -147,7 +147,7 @@ def _stem(key: str) -> str:
 
 
 def _read(path: Path) -> Marker | None:
-    """A marker; None if it is gone or cleared."""
+    """A marker. None if it is gone or cleared."""
     data = None
     with suppress(RecordingError):
         data = read_file(path)

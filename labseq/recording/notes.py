@@ -1,4 +1,4 @@
-"""Note and tags of a run: notes.json in its folder, written by the web page and by the command line."""
+"""Note and tags of a run, in notes.json in its folder, written by the web page and the command line."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ MAX_TAGS: Final = 20
 
 @dataclass(frozen=True, slots=True)
 class Notes:
-    """What people say about a run.
+    """The note and tags of a run.
 
     Attributes:
         comment: The note, any text.
-        tags: Words or short phrases to find it by.
+        tags: Words or short phrases by which to find it.
     """
 
     comment: str = ""
@@ -35,7 +35,7 @@ class Notes:
 
     @classmethod
     def of(cls, comment: str, tags: Iterable[str] = ()) -> Self:
-        """Notes as a user gives them; tags without the spaces around them, each once.
+        """Notes as a user gives them. Spaces around tags and repeated tags are removed.
 
         Raises:
             ConfigError: A text is too long, or there are too many tags.
@@ -57,7 +57,7 @@ class Notes:
 
 
 def read_notes(folder: Path) -> Notes:
-    """Note and tags of a run; empty if there are none or the file is damaged."""
+    """Note and tags of a run. Empty if there are none or the file is damaged."""
     values: Mapping[str, Any] = {}
     with suppress(RecordingError):
         if (folder / NOTES_FILE).exists():

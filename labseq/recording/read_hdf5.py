@@ -1,4 +1,4 @@
-"""Reads HDF5 that labseq wrote, and refuses what it would never write."""
+"""Reads HDF5 that labseq wrote, and refuses types that it would never write."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from labseq.recording.schema import Field
 
 
 def read_attribute(node: Any, name: str, default: Any = None) -> Any:
-    """Read an attribute: a number, a text or a list of texts; ``default`` where there is none.
+    """Read an attribute: a number, a text or a list of texts. ``default`` if it does not exist.
 
     Raises:
-        ValueError: It has a type that labseq does not use.
+        ValueError: The attribute has a type that labseq does not use.
     """
     if not h5a.exists(node.id, name.encode()):
         return default
@@ -42,7 +42,7 @@ def check_attributes(file: Any) -> None:
     """Refuse attributes that cannot be read.
 
     Raises:
-        ValueError: One has a type that labseq does not use.
+        ValueError: An attribute has a type that labseq does not use.
     """
     names = ["/"]
     file.visit(names.append)
@@ -63,10 +63,10 @@ def _read(attribute: Any) -> NDArray[Any]:
 
 
 def read_fields(node: Any, fields: Sequence[Field]) -> dict[str, Any]:
-    """Read attributes: attribute of the record -> plain value; those of a newer minor format are ignored."""
+    """Read attributes: attribute of the record -> plain value. Those of a newer minor format are ignored."""
     values: dict[str, Any] = {}
     for field in fields:
-        # `values` itself stands for an attribute that is missing
+        # `values` itself marks a missing attribute
         value = read_attribute(node, field.name, values)
         if value is values:
             continue
@@ -81,7 +81,7 @@ _KINDS: Final = {"text": str, "integer": int, "int64": int, "bool": bool, "float
 
 
 def read_texts(group: Any, fields: Sequence[Field]) -> dict[str, Any]:
-    """Read texts and JSON: attribute of the record -> value; those of a newer minor format are ignored.
+    """Read texts and JSON: attribute of the record -> value. Those of a newer minor format are ignored.
 
     Raises:
         TypeError: JSON is not a mapping, or for plugins and steps not a list.
@@ -116,12 +116,12 @@ def load_filter(path: Path, dataset: Any) -> None:
     """Load the HDF5 filter for a dataset if it is compressed.
 
     Raises:
-        RecordingError: It is compressed, and the package for it is missing.
+        RecordingError: The dataset is compressed, and the package to read it is missing.
     """
     if dataset.id.get_create_plist().get_nfilters() == 0:
         return
     try:
         import hdf5plugin  # noqa: F401  # pyright: ignore[reportUnusedImport] - importing it registers the filter
     except ImportError as error:
-        problem = "holds compressed frames, and to read them hdf5plugin is needed"
+        problem = "holds compressed frames, which need hdf5plugin to be read"
         raise RecordingError(path, problem, install_hint("compress")) from error

@@ -1,9 +1,9 @@
 """Results of analyses: a file of JSON lines for each analysis, in the run's folder.
 
-A line with "shot" is the result of a shot; of several lines for the same shot the last one counts. Any
-other line describes the analysis of the results that follow it: plugin, version, settings. If "again" in
-it is true, the lines before it no longer count. Large arrays are in an HDF5 file for each shot, in a folder
-beside the lines, which name the dataset.
+A line with "shot" is the result of a shot. The last of several lines for the same shot counts. Any other
+line describes the analysis that gave the results after it: plugin, version, settings. If its "again" is
+true, the lines before it no longer count. Large arrays are in an HDF5 file for each shot, in a folder next
+to the lines, which name the dataset.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from labseq.units import size_text
 SHOT: Final = "shot"
 ERROR: Final = "error"
 ARRAY: Final = "array"
-"""Key of a line in place of a large array, with the name of the dataset."""
+"""Key of a line that replaces a large array, with the name of the dataset."""
 AGAIN: Final = "again"
 _SUFFIX: Final = ".jsonl"
 MAX_TEXT: Final = 1_000_000
-"""Size of a line, in bytes."""
+"""Maximum size of a line, in bytes."""
 
 
 def results_file(run_dir: Path, name: str) -> Path:
@@ -41,11 +41,11 @@ def results_file(run_dir: Path, name: str) -> Path:
 
 
 class ResultsLog:
-    """The file of an analysis, for writing: each line is on the disk before the next shot is analysed.
+    """The file of an analysis, for writing. Each line is on the disk before the next shot is analysed.
 
     Args:
-        path: The file; its folder is made if it does not exist.
-        about: Plugin, version and settings; if "again" is true in it, earlier results no longer count.
+        path: The file. Its folder is created if it does not exist.
+        about: Plugin, version and settings. If its "again" is true, earlier results no longer count.
 
     Raises:
         RecordingError: The file cannot be written.
@@ -63,10 +63,10 @@ class ResultsLog:
         """Check that a result can be written.
 
         Returns:
-            The result, of which only arrays are not plain.
+            The result. Arrays are kept, and all other values are plain.
 
         Raises:
-            TypeError: It is not a mapping of names to values, or a value can be neither JSON nor an array.
+            TypeError: It is not a mapping of names to values, or a value is neither JSON nor an array.
         """
         if not isinstance(result, Mapping):
             raise TypeError(f"the result is {type(result).__name__}; expected a mapping of names to values")
@@ -79,15 +79,15 @@ class ResultsLog:
         row = {name: _checked(value, f"the result '{clean(name)}'") for name, value in values.items()}
         n_bytes = len(dumps({name: value for name, value in row.items() if not _is_large(value)}))
         if n_bytes > MAX_TEXT:
-            what = f"the result is {size_text(n_bytes)} of text, and at most {size_text(MAX_TEXT)} are kept"
-            raise TypeError(f"{what}; return arrays of numpy, each under a name of its own")
+            what = f"the result has {size_text(n_bytes)} of text, more than the {size_text(MAX_TEXT)} allowed"
+            raise TypeError(f"{what}; return numpy arrays, each under its own name")
         return row
 
     def write(self, shot: int, result: Mapping[str, Any]) -> None:
-        """Write the result of a shot; its large arrays first.
+        """Write the result of a shot, its large arrays first.
 
         Raises:
-            RecordingError: It cannot be written.
+            RecordingError: The result cannot be written.
         """
         large = {name: value for name, value in result.items() if _is_large(value)}
         names = {name: str(number) for number, name in enumerate(large)}
@@ -110,15 +110,15 @@ class ResultsLog:
 
 
 def _is_large(value: object) -> bool:
-    # numbers that an array in a line may have; a larger one is in a file of its own
+    # a line may have an array of up to this many numbers, a larger array is in its own file
     return isinstance(value, np.ndarray) and value.size > 1000
 
 
 def _checked(value: Any, what: str) -> Any:
-    """A value as it can be written: plain, or an array of numbers.
+    """A value in the form in which it can be written: plain, or an array of numbers.
 
     Raises:
-        TypeError: It is something else; names its place in the result.
+        TypeError: It is something else. The message names its place in the result.
     """
     if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf":
         return value
@@ -135,7 +135,7 @@ def _checked(value: Any, what: str) -> Any:
     kind = f"array of {value.dtype.name}" if isinstance(value, np.ndarray) else type(value).__name__
     expected = "expected numbers, texts, arrays of numbers, and lists and mappings of them"
     if "complex" in kind:
-        expected = "expected real numbers: return real and imaginary part under two names"
+        expected = "expected real numbers, with real and imaginary part under two names"
     raise TypeError(f"{what} is of the type {kind}; {expected}")
 
 
@@ -172,7 +172,7 @@ class StoredArray:
     dtype: str
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """Read it.
+        """Read the array.
 
         Raises:
             RecordingError: Its file is missing or damaged.
@@ -183,7 +183,7 @@ class StoredArray:
             with h5py.File(self.path, "r", locking=False) as file:
                 array: NDArray[Any] = np.asarray(file[self.dataset])
         except (OSError, KeyError) as error:
-            hint = "'labseq analyse --again' makes the results once more"
+            hint = "'labseq analyse --again' computes the results again"
             raise RecordingError(self.path, f"has no readable array '{self.dataset}'", hint) from error
         return array if dtype is None else array.astype(dtype)
 
@@ -193,11 +193,11 @@ class Results:
 
     Attributes:
         rows: Shot -> its row.
-        about: Plugin, version and settings of the last one; {} if unknown.
+        about: Plugin, version and settings of the last analysis. {} if unknown.
     """
 
     def __init__(self, path: Path) -> None:
-        # longest line that is read over, in bytes: earlier versions of labseq wrote large arrays as lines
+        # longest line in bytes that is skipped, because earlier versions wrote large arrays as lines
         self._lines = NewLines(path, 1 << 28)
         self.rows: dict[int, dict[str, Any]] = {}
         self.about: dict[str, Any] = {}
@@ -221,7 +221,7 @@ def read_results(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Read the file of an analysis, even if it is incomplete or damaged.
 
     Returns:
-        The row of each shot, in order; and plugin, version and settings of the last one, {} if unknown.
+        The row of each shot in order, and plugin, version and settings of the last analysis, {} if unknown.
 
     Raises:
         RecordingError: The file exists but cannot be read.
@@ -253,7 +253,7 @@ def rows_of(run_dir: Path, name: str) -> list[dict[str, Any]]:
 
 
 def _stored(path: Path, shot: int, value: Any) -> Any:
-    """A value of a row; for an array in a file of its own what reads it."""
+    """A value of a row. For an array in its own file, the object that reads it."""
     match value:
         case {"array": str(dataset), "shape": [*shape], "dtype": str(dtype)}:
             return StoredArray(_arrays_file(path, shot), dataset, tuple(shape), dtype)
@@ -265,7 +265,7 @@ def result_columns(run_dir: Path) -> dict[str, dict[int, Any]]:
     """The results of all analyses that are single values: "analysis.NAME.KEY" -> shot -> value.
 
     Raises:
-        RecordingError: They cannot be read.
+        RecordingError: The results cannot be read.
     """
     columns: dict[str, dict[int, Any]] = {}
     for path in sorted((run_dir / folders.RESULTS_FOLDER).glob(f"*{_SUFFIX}")):
@@ -273,7 +273,7 @@ def result_columns(run_dir: Path) -> dict[str, dict[int, Any]]:
         for row in rows:
             for key, value in row.items():
                 if key not in (SHOT, ERROR) and isinstance(value, bool | int | float | str):
-                    # the name that the sequence gives; that of the file has no spaces or slashes
+                    # the name in the sequence, because the file's name has no spaces or slashes
                     name = f"{folders.RESULT_PREFIX}{about.get('analysis', path.stem)}.{key}"
                     columns.setdefault(name, {})[row[SHOT]] = value
     return columns

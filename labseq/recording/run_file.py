@@ -23,9 +23,9 @@ from labseq.recording import schema
 from labseq.recording.folders import PROFILE_FILE, RUN_FILE, SEQUENCE_FILE, STATE_FILE
 
 SCANNER: Final = "scanner"
-"""Key in the record of an adaptive scan (and no other): the scanner and its settings."""
+"""Key that only the record of an adaptive scan has, for the scanner and its settings."""
 WRITTEN_UNITS: Final = "written_units"
-"""Key in the record of a scan whose points are chosen during the run: units in which they are written."""
+"""Key in the record of a scan whose points are chosen during the run: the units of its written values."""
 
 STATUSES: Final = ("running", "complete", "stopped", "failed")
 
@@ -35,7 +35,7 @@ class OtherFormatError(RecordingError):
 
 
 def check_version(path: Path, version: str, own_version: str) -> None:
-    """Raise for a file whose format has another major version.
+    """Raise if the format of a file has another major version.
 
     Args:
         path: The file.
@@ -45,7 +45,7 @@ def check_version(path: Path, version: str, own_version: str) -> None:
     version = clean(version)
     major = version.partition(".")[0]
     if not major.isdecimal():
-        advice = f"expected one like {own_version}; it is damaged"
+        advice = f"expected a version like {own_version}; restore it from a backup"
         raise RecordingError(path, f"has the format version '{version}'", advice)
     if major != own_version.partition(".")[0]:
         development = "the development version of labseq 0.2.0 that wrote it"
@@ -86,7 +86,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     """Read run.json.
 
     Raises:
-        RecordingError: It is damaged, or of another format.
+        RecordingError: It is damaged, or has another format.
     """
     path = folder / RUN_FILE
     record = parse_object(read_file(path))
@@ -109,10 +109,10 @@ def read_run(folder: Path) -> dict[str, Any]:
 
 
 def read_record(folder: Path) -> RunRecord:
-    """The record of a run, from run.json as :func:`encode_run` writes it.
+    """The record of a run, read from run.json as :func:`encode_run` writes it.
 
     Raises:
-        RecordingError: It is damaged, or of another format.
+        RecordingError: It is damaged, or has another format.
     """
     path, values = folder / RUN_FILE, read_run(folder)
     arguments: dict[str, Any] = {name: values[name] for name in RunRecord.__match_args__ if name in values}
@@ -124,10 +124,10 @@ def read_record(folder: Path) -> RunRecord:
 
 
 def target_of(path: Path, record: Mapping[str, Any]) -> TargetPattern:
-    """The target in run.json.
+    """The target of a run from run.json.
 
     Raises:
-        RecordingError: It is damaged.
+        RecordingError: The target is damaged.
     """
     try:
         target = record["target"]
@@ -138,12 +138,12 @@ def target_of(path: Path, record: Mapping[str, Any]) -> TargetPattern:
 
 
 def regions_of(resolved: Mapping[str, Any]) -> dict[str, NDArray[np.bool_]]:
-    """The regions in the settings of a run; none in runs of earlier versions."""
+    """The regions in the settings of a run. Runs of earlier versions have none."""
     return {name: _grid(rows) for name, rows in resolved.get("regions", {}).items()}
 
 
 def plain_regions(target: TargetPattern) -> dict[str, list[str]]:
-    """The regions of a target as the settings of a run have them: a text of 0 and 1 for each row."""
+    """The regions of a target in the form of a run's settings, with a text of 0 and 1 for each row."""
     return {name: _rows(mask) for name, mask in target.regions.items()}
 
 
@@ -156,13 +156,13 @@ def _grid(rows: list[str]) -> NDArray[np.bool_]:
 
 
 def encode_state(status: RunStatus, error: str = "", ended_early: str = "") -> bytes:
-    """The content of STATE: one line with the status, and the process that runs the run."""
+    """The content of STATE: one line with the status and the process that takes the run."""
     ends = {"error": error, "ended_early": ended_early}
     return dumps({"state": status, **asdict(Process.current()), **ends}).encode() + b"\n"
 
 
 def read_state_file(folder: Path) -> dict[str, Any]:
-    """The content of STATE as it is; empty if it is missing or damaged."""
+    """The content of STATE as it is. Empty if it is missing or damaged."""
     try:
         return parse_object(read_file(folder / STATE_FILE)) or {}
     except RecordingError:
@@ -188,7 +188,7 @@ def read_state(folder: Path) -> tuple[RunStatus, str]:
 
 
 def describe_end(folder: Path) -> str:
-    """How a run ended that may have left devices on, as the end of a sentence about it."""
+    """How a run that may have left devices on has ended, as the end of a sentence about it."""
     state = read_state_file(folder)
     if state.get("state") in (None, "running"):
         return "died"
@@ -197,7 +197,7 @@ def describe_end(folder: Path) -> str:
 
 
 def read_owner(folder: Path) -> Process | None:
-    """The process that runs or ran a run; None if unknown."""
+    """The process that takes or took a run. None if unknown."""
     return Process.from_plain(read_state_file(folder))
 
 

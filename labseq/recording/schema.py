@@ -1,4 +1,4 @@
-"""The schema of the shot file and of a run's index: every value, with its type, unit and description.
+"""The schema of the shot file and of a run's index: every value with its type, unit and description.
 
 The tree of a shot file, with n images, a grid of (row, col) sites and frames of (y, x) pixels::
 
@@ -10,7 +10,7 @@ The tree of a shot file, with n images, a grid of (row, col) sites and frames of
       images_view               NXdata: what viewers open by default
       detection                 occupancy (n, row, col), confidence, signal, t_s and the table of images;
                                 threshold (row, col), sites_px (row, col, yx)
-      rearrangement             tables of moves, batches and cycles, and of paths where tones have some;
+      rearrangement             tables of moves, batches and cycles, and of paths if tones have paths;
                                 predicted (cycle, row, col)
       steps                     table of the steps: planned and achieved durations
       edges                     table of the changes of the lines, if there are any
@@ -18,8 +18,8 @@ The tree of a shot file, with n images, a grid of (row, col) sites and frames of
       atom_events               tables of the events of the atoms in a simulation
 
 To record a new value, add an attribute to the record in :mod:`labseq.model.records` and a row here. The
-writer, the reader, the index, the exports and the reference page follow. A table is one compound dataset:
-a dataset costs 0.1 ms, however many columns it has.
+writer, the reader, the index, the exports and the reference page follow. A table is one compound dataset
+because a dataset costs 0.1 ms, however many columns it has.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ from labseq.plain import plain_text
 
 FORMAT: Final = "labseq-shot"
 FORMAT_VERSION: Final = "4.2"
-"""major.minor: a newer minor version only adds values; another major version cannot be read."""
+"""major.minor. A newer minor version only adds values. Files of another major version cannot be read."""
 
 RUN_FORMAT: Final = "labseq-run"
 RUN_FORMAT_VERSION: Final = "4.0"
 
 LIBRARY_VERSIONS: Final = ("earliest", "v110")
-"""Range of HDF5 versions whose features files may use: most programs read these."""
+"""Range of HDF5 versions whose features files may use, which most programs can read."""
 
 _UNITS: Final = {
     **{unit: unit for unit in ("s", "m", "K", "Hz", "rad", "V", "W", "A", "px")},
@@ -59,7 +59,7 @@ _getter: Final = cache(attrgetter)
 
 
 def unit_of(name: str) -> str:
-    """Unit of a value, from the suffix of its name; "" if that is not a unit.
+    """Unit of a value, from the suffix of its name. "" if the suffix is not a unit.
 
     Example:
         >>> unit_of("laser.power_w"), unit_of("spacing_m"), unit_of("seen"), unit_of("beat_hz")
@@ -75,8 +75,8 @@ class Field:
     Attributes:
         name: Name of the attribute, dataset or column in the file.
         dtype: numpy's name of its type, "text" (UTF-8), "json", or "integer" (text beyond 64 bits).
-        description: What it is.
-        attribute: Attribute of the record that it is read from, dotted.
+        description: What the value is.
+        attribute: Attribute of the record from which it is read, dotted.
     """
 
     name: str
@@ -95,11 +95,11 @@ class Field:
 
 
 def _fields(text: str, **attributes: str) -> tuple[Field, ...]:
-    """Fields from lines of name, type and description; an indented line continues the one before.
+    """Make fields from lines of name, type and description. An indented line continues the previous one.
 
     Args:
         text: The lines.
-        **attributes: Name -> attribute of the record, where that is another.
+        **attributes: Name -> attribute of the record, if it has another name.
     """
     lines = re.sub(r"\n +", " ", textwrap.dedent(text).strip()).splitlines()
     rows = (line.split(None, 2) for line in lines)
@@ -113,11 +113,11 @@ class Table:
     """A compound dataset: one row per record.
 
     Attributes:
-        path: Where it is, below ``/entry``.
+        path: Its path below ``/entry``.
         row: What one row describes.
         description: What the table is.
         columns: Its columns.
-        arrays: For a table with several rows of a record: record -> column -> array, or number for all rows.
+        arrays: For several rows per record: record -> column -> array, or one number for all rows.
     """
 
     path: str
@@ -143,7 +143,7 @@ class Table:
     def arguments(self, kind: type, table: NDArray[Any]) -> list[dict[str, Any]]:
         """Convert rows that were read to arguments for the constructor of a record.
 
-        Values that its constructor does not take are left out, as are columns that an older file lacks.
+        Values that its constructor does not take are left out, and so are columns that an older file lacks.
         """
         parameters = {field.name for field in fields(kind)}
         columns = {
@@ -155,7 +155,7 @@ class Table:
 
 
 def _together(dtype: list[tuple[str, Any]], columns: Mapping[str, Any]) -> NDArray[Any]:
-    """Columns, of which numbers are repeated, as one table."""
+    """Columns as one table. Single numbers are repeated."""
     table = np.empty(np.broadcast_shapes(*map(np.shape, columns.values())), dtype)
     for name, values in columns.items():
         table[name] = values
@@ -163,7 +163,7 @@ def _together(dtype: list[tuple[str, Any]], columns: Mapping[str, Any]) -> NDArr
 
 
 def _column(column: Field, values: list[Any]) -> NDArray[Any]:
-    """The values of a column; a text column is as wide as its longest text, in bytes of UTF-8."""
+    """The values of a column. A text column is as wide as its longest text, in bytes of UTF-8."""
     if column.dtype != "text":
         return np.array(values, column.dtype)
     import h5py  # takes 0.1 s to import
@@ -184,23 +184,23 @@ IN_INDEX: Final = _fields(
     error                   text     why it did not complete, or empty
     t_start_utc             text     wall time of its start, ISO 8601, UTC
     t_end_utc               text     wall time of its end, ISO 8601, UTC
-    success                 bool     whether the last image step met the target;
+    success                 bool     whether the last image step met the target,
                                      false (in the index null) where it is not judged
-    filling_fraction        float64  filling of the target on the last image step; nan without one
-    seen_defect_free_cycle  int64    index of the first cycle whose image met the target; -1 if none
+    filling_fraction        float64  filling of the target on the last image step, nan without one
+    seen_defect_free_cycle  int64    index of the first cycle whose image met the target, -1 if none
     n_images                int64    number of images
     n_cycles                int64    number of rearrangement cycles
     n_batches               int64    batches that were played
     n_atom_moves            int64    atom moves that were played
-    n_missing_atoms         int64    atoms that the loading fell short of the target
+    n_missing_atoms         int64    number of atoms by which the loading fell short of the target
     """,
     shot="shot_index",
 )
-"""Attributes of ``/entry``, of a :class:`ShotRecord`, which are also in a shot's line of the index."""
+"""Attributes of ``/entry``, from a :class:`ShotRecord`, which are also in a shot's line of the index."""
 
 SHOT: Final = (
     *IN_INDEX,
-    *_fields("seed integer seed of the run; text where it does not fit into 64 bits"),
+    *_fields("seed integer seed of the run, as text if it does not fit into 64 bits"),
 )
 """All attributes of ``/entry``."""
 
@@ -210,7 +210,7 @@ SHOT_TEXTS: Final = _fields(
     calibrations  json  the calibrations in use: kind -> id
     """
 )
-"""Texts in ``/entry``, of a :class:`ShotRecord`."""
+"""Texts in ``/entry``, from a :class:`ShotRecord`."""
 
 RUN: Final = _fields(
     """
@@ -225,7 +225,7 @@ RUN: Final = _fields(
     """,
     target="target.name",
 )
-"""Attributes of ``/entry/run``, of a :class:`RunRecord`."""
+"""Attributes of ``/entry/run``, from a :class:`RunRecord`."""
 
 RUN_TEXTS: Final = _fields(
     """
@@ -233,16 +233,16 @@ RUN_TEXTS: Final = _fields(
     profile     text  the hardware profile
     steps       json  names of the steps of a shot, in order
     resolved    json  every setting after defaults and overrides, SI
-    overrides   json  what --set and other options changed: address -> value, SI; unit; as written
-    units       json  SI units of what was set and scanned: address -> unit
+    overrides   json  changes by --set and other options: address -> value in SI, unit, value as typed
+    units       json  SI units of settings and scanned values: address -> unit
     plugins     json  each plugin that was used: name, version, origin, digest and commit of its sources
     devices     json  what each device reports about itself, SI: role -> values
-    provenance  json  where the run comes from: versions, commits, host, user
+    provenance  json  origin of the run: versions, commits, host, user
     """,
     sequence="sequence_text",
     profile="profile_text",
 )
-"""Texts in ``/entry/run``, of a :class:`RunRecord`."""
+"""Texts in ``/entry/run``, from a :class:`RunRecord`."""
 
 IMAGES: Final = Table(
     "detection/images",
@@ -251,10 +251,10 @@ IMAGES: Final = Table(
     _fields(
         """
         step        i4    index of the step in the shot, from 0
-        cycle       i4    index of the rearrangement cycle that it ended, from 0; -1 for that of an image step
+        cycle       i4    index of the rearrangement cycle that it ended, from 0, -1 for an image step
         t_start_s   f8    start of the exposure, from the start of the shot
         exposure_s  f8    exposure time
-        name        text  its name, the same in every shot: that of its step, with the cycle that it ended
+        name        text  its name, the same in every shot: its step's name, with the cycle that it ended
         """
     ),
 )
@@ -266,9 +266,9 @@ EXPOSURES: Final = Table(
     "when and how each frame was taken",
     _fields(
         """
-        number      i4  place in the camera's series as the camera counted it, from 0
+        number      i4  index in the camera's series as counted by the camera, from 0
         t_clock_s   f8  start of the exposure on the session's clock
-        t_device_s  f8  the camera's own time stamp, from a zero of its own; nan if it gives none
+        t_device_s  f8  the camera's own time stamp, with its own zero, nan if it gives none
         exposure_s  f8  exposure time that the camera reports
         """,
         t_clock_s="t_start_s",
@@ -285,16 +285,16 @@ CYCLES: Final = Table(
         """
         step                 i4  index of the step in the shot, from 0
         cycle                i4  index of the rearrangement cycle in its step, from 0
-        n_batches            i4  batches of the plan
-        n_batches_played     i4  batches that fitted into the window and were played
-        n_atom_moves         i4  atom moves of the plan
+        n_batches            i4  number of batches of the plan
+        n_batches_played     i4  number of batches that fitted into the window and were played
+        n_atom_moves         i4  number of atom moves of the plan
         n_defects_predicted  i4  empty target sites after the whole plan if no atom is lost
         n_surplus_predicted  i4  atoms after the whole plan on sites that must be empty
         t_start_s            f8  start of the cycle, from the start of the shot
-        window_s             f8  time that the cycle had from its start to the end of the moves
+        window_s             f8  time for the cycle from its start to the end of the moves
         planned_duration_s   f8  from the start of the cycle to the end of the plan's last batch
-        moves_s              f8  modelled duration of what was played, overheads included
-        late_s               f8  how long after the window the moves ended; 0 if they ended in time
+        moves_s              f8  modelled duration of what was played, including overheads
+        late_s               f8  time by which the moves ended after the window, 0 if they ended in time
         """,
         n_batches="plan.n_batches",
         n_atom_moves="plan.n_atom_moves",
@@ -370,13 +370,13 @@ BATCHES: Final = Table(
         step            i4  index of the step in the shot, from 0
         cycle           i4  index of the rearrangement cycle in its step, from 0
         batch           i4  index of the batch in its cycle, from 0
-        n_atom_moves    i4  atom moves in it
-        n_tweezers      i4  mobile tweezers on in it, crossings without an atom included
-        end_s           f8  when it ends, from the start of the cycle, overheads included
-        linked          ?   whether the tweezers of the batch before stay on for this one
-        n_knots         i4  knots of the tones' paths; 0 for a line batch
-        n_row_tones     i4  row tones with a path
-        n_column_tones  i4  column tones with a path
+        n_atom_moves    i4  number of atom moves in it
+        n_tweezers      i4  number of mobile tweezers on in it, including crossings without an atom
+        end_s           f8  its end, from the start of the cycle, including overheads
+        linked          ?   whether the tweezers of the previous batch stay on for this one
+        n_knots         i4  number of knots of the tones' paths, 0 for a line batch
+        n_row_tones     i4  number of row tones with a path
+        n_column_tones  i4  number of column tones with a path
         played          ?   whether it fitted into the window and was played
         """
     ),
@@ -393,11 +393,11 @@ MOVES: Final = Table(
         step      i4  index of the step in the shot, from 0
         cycle     i4  index of the rearrangement cycle in its step, from 0
         batch     i4  index of the batch in its cycle, from 0
-        from_row  i2  row that the atom is taken from
-        from_col  i2  column that the atom is taken from
-        to_row    i2  row that it is brought to; beyond the grid where it is ejected
-        to_col    i2  column that it is brought to; beyond the grid where it is ejected
-        linked    ?   whether the tweezers of the batch before stay on for this one
+        from_row  i2  row from which the atom is taken
+        from_col  i2  column from which the atom is taken
+        to_row    i2  row to which it is brought, beyond the grid if it is ejected
+        to_col    i2  column to which it is brought, beyond the grid if it is ejected
+        linked    ?   whether the tweezers of the previous batch stay on for this one
         played    ?   whether it fitted into the window and was played
         """
     ),
@@ -408,7 +408,7 @@ MOVES: Final = Table(
 PATHS: Final = Table(
     "rearrangement/paths",
     "position",
-    "the paths of the tones, where rows and columns move at once; left out if no plan has any",
+    "the paths of tones, if rows and columns move at once, left out if no plan has paths",
     _fields(
         """
         step      i4  index of the step in the shot, from 0
@@ -433,11 +433,11 @@ TIMING: Final = Table(
         """
         stage        text  name of the stage: load, expose, detect, plan, check, prepare, play, ...
         step         i4    index of the step in the shot, from 0
-        cycle        i4    index of the rearrangement cycle, from 0; -1 outside of one
+        cycle        i4    index of the rearrangement cycle, from 0, -1 outside a cycle
         t_start_s    f8    start on the session's clock, from the start of the shot
-        duration_s   f8    duration on the session's clock; in a dry run the modelled time
+        duration_s   f8    duration on the session's clock, which in a dry run is the modelled time
         host_s       f8    duration on the computer's clock
-        budget_s     f8    what it may take; nan without a budget
+        budget_s     f8    time that it may take, nan without a budget
         over_budget  ?     whether it took longer than its budget
         """
     ),
@@ -452,11 +452,11 @@ STEPS: Final = Table(
         """
         step        i4    index of the step in the shot, from 0
         name        text  name of the step
-        timed_by    text  what timed it: computer, or hardware: camera, lines, static_tweezers, ...
+        timed_by    text  what timed it: computer, or a piece of hardware: camera, lines, static_tweezers, ...
         t_start_s   f8    start on the session's clock, from the start of the shot
-        planned_s   f8    planned duration; at most, where the step may end earlier
-        achieved_s  f8    duration as the hardware reports it, otherwise of the step on the session's clock
-        host_s      f8    duration on the computer's clock with all calls; in a dry run the computing
+        planned_s   f8    planned duration, or its maximum if the step may end earlier
+        achieved_s  f8    duration reported by the hardware, or else of the step on the session's clock
+        host_s      f8    duration on the computer's clock with all calls, in a dry run the computing time
         """
     ),
 )
@@ -465,13 +465,13 @@ STEPS: Final = Table(
 EDGES: Final = Table(
     "edges",
     "edge",
-    "the changes of the lines, as the timing box played them; left out if there are none",
+    "the changes of the lines, as the timing box played them, left out if there are none",
     _fields(
         """
         step       i4    index of the step in the shot, from 0
         line       text  name of the line
         on         ?     whether it is on from then on
-        t_s        f8    when, from the start of the program of its step: a multiple of the box's resolution
+        t_s        f8    time from the start of its step's program, a multiple of the box's resolution
         t_start_s  f8    start of this program on the session's clock, from the start of the shot
         """
     ),
@@ -482,7 +482,7 @@ TABLES: Final = (IMAGES, EXPOSURES, MOVES, BATCHES, PATHS, CYCLES, STEPS, EDGES,
 
 
 def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> list[CycleRecord]:
-    """The cycles from their tables.
+    """Build the cycles from their tables.
 
     Args:
         tables: "cycles", "batches" and "moves" -> rows, and "paths", which files without paths lack.
@@ -497,7 +497,7 @@ def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> li
     ):
         if not 0 <= row["n_batches_played"] <= row["n_batches"]:
             raise ValueError(f"{row['n_batches_played']} of {row['n_batches']} batches were played")
-        # the tables hold the rows of all cycles, one after the other: each cycle takes its own from the front
+        # the tables hold the rows of all cycles in order, and each cycle takes its own from the front
         own_batches, batches = batches[: row["n_batches"]], batches[row["n_batches"] :]
         own_sites, sites = sites[: row["n_atom_moves"]], sites[row["n_atom_moves"] :]
         offsets = np.concatenate([[0], np.cumsum(own_batches["n_atom_moves"])])
@@ -518,7 +518,7 @@ def cycles_of(tables: Mapping[str, NDArray[Any]], predicted: NDArray[Any]) -> li
 
 
 def _shapes_of(batches: NDArray[Any]) -> NDArray[np.int32]:
-    """Shapes of the paths of batches that were read; files before version 4.1 have none."""
+    """Shapes of the paths of batches that were read. Files before version 4.1 have none."""
     if _SHAPE[0] not in (batches.dtype.names or ()):
         return np.zeros((len(batches), 3), np.int32)
     return np.stack([batches[name] for name in _SHAPE], axis=1)
@@ -529,11 +529,11 @@ class Dataset:
     """A plain array in a shot's file.
 
     Attributes:
-        path: Where it is, below ``/entry``.
+        path: Its path below ``/entry``.
         dtype: numpy's name of its type.
-        axes: Its axes.
-        description: What it is.
-        units: Unit of its numbers; "" for none.
+        axes: Names of its axes.
+        description: What the dataset is.
+        units: Unit of its numbers. "" for none.
     """
 
     path: str
@@ -544,17 +544,17 @@ class Dataset:
 
 
 OF_DETECTOR: Final = "of the detector"
-"""Units that the detector gives: counts, log-odds."""
+"""Units that the detector gives, such as counts or log-odds."""
 
 _ARRAYS: Final = """\
 target/fill              uint8    row, col         -    1 where the target must hold an atom
 target/clear             uint8    row, col         -    1 where the target must be empty
 camera/<name>/frames     uint16   frame, y, x      adu  frames as the camera delivered them
 camera/<name>/t_s        float64  frame            s    start of the exposure, from the start of the shot
-camera/<name>/image      int32    frame            -    row of detection/images that the frame belongs to
+camera/<name>/image      int32    frame            -    row of detection/images to which the frame belongs
 detection/occupancy      uint8    image, row, col  -    1 where the detector saw an atom
 detection/confidence     float32  image, row, col  -    the detector's confidence in each site
-detection/sites_px       float64  row, col, yx     px   place of each site on the frames: y, x
+detection/sites_px       float64  row, col, yx     px   position (y, x) of each site on the frames
 detection/t_s            float64  image            s    start of the exposure, from the start of the shot
 rearrangement/predicted  uint8    cycle, row, col  -    1 where the whole plan leaves an atom if none is lost
 """
@@ -567,7 +567,7 @@ ARRAYS: Final[Mapping[str, Dataset]] = {
         "detection/signal",
         "float64",
         "image, row, col",
-        "what the detector compared with the threshold; there is an atom where it is larger",
+        "value that the detector compares with the threshold, above which there is an atom",
         OF_DETECTOR,
     ),
     "detection/threshold": Dataset(
@@ -586,16 +586,16 @@ PARAMETER: Final = Dataset(
 """A dataset for each setting that differs from the files in the shot."""
 
 ATOM_EVENTS: Final = Table(
-    "atom_events/<name>", "row", "what a simulation reports about the atoms; see its plugin", ()
+    "atom_events/<name>", "row", "what a simulation reports about the atoms, see its plugin", ()
 )
-"""A simulation names the columns of its tables itself."""
+"""The columns of these tables are named by the simulation."""
 
 
 def describe_columns(table: np.dtype[Any], schema_table: Table) -> tuple[list[str], list[str]]:
     """Units and descriptions of the columns of a table.
 
     Args:
-        table: Its dtype; a simulation describes columns by ``metadata={"descriptions": {column: text}}``.
+        table: Its dtype. A simulation describes columns by ``metadata={"descriptions": {column: text}}``.
         schema_table: The columns in the schema.
 
     Example:

@@ -32,10 +32,10 @@ _AXES: Final = ("t_s", ".", ".")
 
 
 class ShotEncoder:
-    """Turns the shots of one run into the bytes of HDF5 files.
+    """Encodes the shots of one run as HDF5 files.
 
-    The file is built in memory, so that a full disk cannot interrupt HDF5, and so that the hashed bytes
-    are exactly the written ones.
+    A file is built in memory, so that a full disk cannot interrupt HDF5, and so that the hashed bytes
+    are exactly the written bytes.
     """
 
     def __init__(self, run: RunRecord, run_id: str) -> None:
@@ -45,10 +45,10 @@ class ShotEncoder:
         self._common = b""
 
     def encode(self, shot: ShotRecord) -> memoryview:
-        """The bytes of the shot's file.
+        """Encode a shot as the bytes of its file.
 
         Raises:
-            RecordingError: The record contradicts itself, for example occupancies of different shapes.
+            RecordingError: The record contradicts itself, for example with occupancies of different shapes.
         """
         try:
             arrays = [
@@ -61,9 +61,9 @@ class ShotEncoder:
                 self._write_shot(file["entry"], shot)
         except Exception as error:  # a plugin's camera or step may put anything into the record
             where = f"shot {shot.shot_index} (attempt {shot.attempt})"
-            problem = f"cannot be laid out as a file: {format_error(error)}"
+            problem = f"cannot be written as a file: {format_error(error)}"
             raise RecordingError(where, problem, "see the plugin that made it") from error
-        # of the bytes, which are not copied: the buffer's own view would keep it from being closed
+        # of the bytes, which are not copied, because the buffer's own view would keep it from being closed
         return memoryview(buffer.getvalue())
 
     def _write_shot(self, entry: Any, shot: ShotRecord) -> None:
@@ -98,7 +98,7 @@ class ShotEncoder:
         return [i for i in recorded if images[i].frame is not None]
 
     def _write_frames(self, entry: Any, images: Sequence[ImageRecord], kept: Sequence[int]) -> None:
-        series: dict[tuple[str, tuple[int, ...]], list[int]] = {}  # frames of one size share a dataset
+        series: dict[tuple[str, tuple[int, ...]], list[int]] = {}  # frames of the same size share a dataset
         for i in kept:
             frame = cast("Frame", images[i].frame)
             series.setdefault((frame.camera, frame.image.shape), []).append(i)
@@ -118,7 +118,7 @@ class ShotEncoder:
         options: dict[str, Any] = {"chunks": (1, *shape)} if all(shape) else {}
         stack = group.create_dataset("frames", (len(frames), *shape), np.uint16, **options)
         for i, frame in enumerate(frames):
-            if options:  # a quarter less time than through HDF5's chunk cache
+            if options:  # takes a quarter less time than HDF5's chunk cache
                 stack.id.write_direct_chunk((i, 0, 0), frame.image)
             else:
                 stack[i] = frame.image
@@ -131,7 +131,7 @@ class ShotEncoder:
 
 
 def _encode_common(run: RunRecord, run_id: str, shot: ShotRecord) -> bytes:
-    """A file with what shots share, the detector's values among it; completing it takes half the time."""
+    """A file with the values that shots share, including the detector's. Completing it halves the time."""
     buffer = io.BytesIO()
     values = {field.name: getattr(run, field.name) for field in fields(run)}
     hashes = {f"{name}_sha256": sha256_of_text(values[f"{name}_text"]) for name in ("sequence", "profile")}
@@ -164,7 +164,7 @@ def _write_detection(group: Any, shot: ShotRecord, grid_shape: tuple[int, int]) 
         names.append("signal")
     for name in names:
         values = [getattr(image, name) for image in shot.images]
-        if name == "signal":  # nan for an image without
+        if name == "signal":  # nan for an image without a signal
             values = [np.full(grid_shape, np.nan) if value is None else value for value in values]
         stack = np.array(values, schema.ARRAYS[f"detection/{name}"].dtype).reshape(len(values), *grid_shape)
         units = shot.signal_unit if name == "signal" else None

@@ -34,7 +34,7 @@ class ShotContent:
     """A shot's file without its frames.
 
     Attributes:
-        record: The shot's record; its images have no frames.
+        record: The shot's record. Its images have no frames.
         run: Values that all shots of the run share: attribute of :class:`RunRecord` -> value.
         target: The target of the run.
     """
@@ -45,7 +45,7 @@ class ShotContent:
 
     @property
     def run_id(self) -> str:
-        """The run's folder, relative to the data root that it was written to."""
+        """The run's folder, relative to the data root to which it was written."""
         return self.run["run_id"]
 
 
@@ -53,14 +53,14 @@ def read_content(path: Path) -> ShotContent:
     """Read a shot's file without its frames.
 
     Raises:
-        RecordingError: It is missing, damaged, or of another format.
+        RecordingError: The file is missing, damaged, or of another format.
     """
     with opened(path) as entry:
         return content_of(entry)
 
 
 def content_of(entry: Any) -> ShotContent:
-    """Read a shot's file, :func:`opened`, without its frames."""
+    """Read a shot's file without its frames, from a group that :func:`opened` gave."""
     run = read_fields(entry["run"], schema.RUN) | read_texts(entry["run"], schema.RUN_TEXTS)
     if missing := [text.name for text in schema.RUN_TEXTS if text.attribute not in run]:
         raise ValueError(f"/entry/run/{missing[0]} is missing")
@@ -82,8 +82,8 @@ def read_frames(path: Path) -> dict[int, Frame]:
     """Read the frames of a shot's file: index of the image -> frame, in the order they were taken.
 
     Raises:
-        RecordingError: As for :func:`read_content`; or the frames are compressed
-            and the package for it is missing; or two of them are of the same image.
+        RecordingError: As for :func:`read_content`, or the frames are compressed and the package to read
+            them is missing, or two frames belong to the same image.
     """
     frames: dict[int, Frame] = {}
     for i, frame in iter_frames(path):
@@ -94,11 +94,11 @@ def read_frames(path: Path) -> dict[int, Frame]:
 
 
 def iter_frames(path: Path, only: int | None = None) -> Generator[tuple[int, Frame]]:
-    """Read the frames one by one, with the index of the image of each; see :func:`read_frames`.
+    """Read the frames one by one, with the index of the image of each, see :func:`read_frames`.
 
     Args:
         path: The file.
-        only: Index of the one image whose frame is read; None for all.
+        only: Index of the one image whose frame is read. None for all.
     """
     with opened(path, "/entry/camera") as entry:
         for group in entry["camera"].values() if "camera" in entry else ():
@@ -122,16 +122,16 @@ def with_frames(record: ShotRecord, frames: dict[int, Frame]) -> ShotRecord:
 
 @contextlib.contextmanager
 def opened(path: Path, only: str = "") -> Generator[Any]:
-    """Open a shot's file to read its group ``/entry``; an error in the body reports the file as damaged.
+    """Open a shot's file to read its group ``/entry``. An error in the body reports the file as damaged.
 
     Args:
         path: The file.
-        only: The one dataset or group that will be read; "" for any.
+        only: The one dataset or group that will be read. "" for any.
 
     Raises:
-        RecordingError: It is missing, damaged, or of another format.
+        RecordingError: The file is missing, damaged, or of another format.
     """
-    # opening a named pipe would wait for ever
+    # opening a named pipe would wait forever
     if other_kind := something_else(path):
         raise RecordingError(path, f"cannot be read: {other_kind}", "restore it from a backup")
     if not path.is_file():
@@ -147,13 +147,13 @@ def opened(path: Path, only: str = "") -> Generator[Any]:
 
 
 def open_finished(path: Path) -> h5py.File:
-    """Open a file that never changes again without a lock, as locks fail on network folders."""
+    """Open a file that never changes again without a lock, because locks fail on network folders."""
     try:
         return h5py.File(path, "r", locking=False)
     except OSError as error:
         if "locking flag" not in str(error):
             raise
-        return h5py.File(path, "r")  # this process has it open with a lock: HDF5 allows no mixture
+        return h5py.File(path, "r")  # this process has it open with a lock, and HDF5 allows no mixture
 
 
 @contextlib.contextmanager
@@ -167,7 +167,7 @@ def damage_reported(path: Path) -> Generator[None]:
         yield
     except RecordingError:
         raise
-    except Exception as error:  # of h5py, numpy, and whatever a damaged file has instead of the values
+    except Exception as error:  # from h5py, numpy, or unexpected content of a damaged file
         raise RecordingError(path, f"is damaged: {error_text(error)}", "restore it from a backup") from error
 
 
@@ -208,7 +208,7 @@ def _images(group: Any) -> list[ImageRecord]:
 
 
 def _detector(group: Any) -> dict[str, Any]:
-    """The values that a detector reported about itself, as arguments of the shot's record."""
+    """The values that the detector reported about itself, as arguments of the shot's record."""
     values: dict[str, Any] = {
         argument: group[name][()]
         for argument, name in (("thresholds", "threshold"), ("sites_px", "sites_px"))

@@ -15,16 +15,16 @@ from labseq.plain import dumps, plain_text, to_plain
 from labseq.recording.schema import ARRAYS, Dataset, Field, Table, describe_columns
 
 _SCALAR: Final = h5s.create(h5s.SCALAR)
-"""Made once, as it takes 8 us and a shot's file has more than a hundred attributes."""
+"""Created once because it takes 8 us, and a shot's file has more than a hundred attributes."""
 
 
 def text_array(texts: str | Sequence[str], max_bytes: int = 1 << 31) -> NDArray[Any]:
-    """Texts as an array of bytes of one length, UTF-8; those longer than ``max_bytes`` are cut.
+    """Texts as an array of UTF-8 bytes of one length. Texts longer than ``max_bytes`` are cut.
 
-    Texts of variable length would be in a part of the file that HDF5 reads without an end if it is damaged.
+    Texts of variable length would be in a part of the file that HDF5 reads without end if it is damaged.
     """
     several = [texts] if isinstance(texts, str) else texts
-    # decoded once more after the cut, which may be within a character
+    # decoded again after the cut, which may be within a character
     data = [plain_text(text).encode()[:max_bytes].decode(errors="ignore").encode() for text in several]
     kind = h5py.string_dtype("utf-8", max(map(len, data), default=1) or 1)
     return np.array(data[0] if isinstance(texts, str) else data, kind)
@@ -39,7 +39,7 @@ def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
 
 
 def add_attribute(node: Any, name: str, array: NDArray[Any]) -> None:
-    """Add an attribute that is an array already."""
+    """Add an attribute from an array."""
     kind = h5t.py_create(array.dtype, logical=True)
     space = h5s.create_simple(array.shape) if array.shape else _SCALAR
     h5a.create(node.id, name.encode(), kind, space).write(array, mtype=kind)
@@ -94,7 +94,7 @@ def _is_numeric(value: Any) -> bool:
 
 
 def write_array(group: Any, path: str, values: Any, units: str | None = None) -> Any:
-    """Add an array of :data:`ARRAYS` under the last part of its path; ``units`` replace the schema's."""
+    """Add an array of :data:`ARRAYS` under the last part of its path. ``units`` replaces the schema's."""
     array = ARRAYS[path]
     dataset = group.create_dataset(path.rpartition("/")[2], data=np.asarray(values, array.dtype))
     describe(dataset, array, units)
@@ -108,7 +108,7 @@ def describe(dataset: Any, array: Dataset, units: str | None = None) -> None:
 
 
 def write_table(group: Any, table: Table, rows: NDArray[Any], name: str = "") -> None:
-    """Add a table of the schema under ``name``, else the last part of its path."""
+    """Add a table of the schema under ``name``, or else under the last part of its path."""
     dataset = group.create_dataset(name or table.path.rpartition("/")[2], data=rows)
     units, descriptions = _of_known_columns(table) if table.columns else _of_columns(rows.dtype, table)
     add_attribute(dataset, "units", units)

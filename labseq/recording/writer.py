@@ -35,24 +35,24 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 ANSWER_S: Final = 5.0
-"""Time limit for writing a file; after it nothing more is written, and the run ends."""
+"""Time limit for writing a file. After that nothing more is written, and the run ends."""
 
 
 class RunWriter:
-    """The folder of a run in progress; made by :meth:`create` or :meth:`reopen`, used by one process.
+    """The folder of a run in progress, opened by :meth:`create` or :meth:`reopen` and used by one process.
 
     A shot is complete on the disk before its line is in the index. So the shots
     in the index are intact even after a kill or a full disk.
 
-    The disk is written to in a thread of its own. If it does not answer within ANSWER_S, or the run is asked
-    to stop twice, that thread is abandoned, so that the devices are made safe. Nothing is written then.
+    A separate thread writes to the disk. If the disk does not answer within ANSWER_S, or the run is asked
+    to stop twice, that thread is abandoned so that the devices are made safe. Nothing is written after that.
 
     Attributes:
         run_dir: The run's folder.
         run: The run's record, of which each shot has a copy.
-        n_written: Shots written that count; failed attempts do not count.
+        n_written: Number of shots written that count. Failed attempts do not count.
         ended_early: Why the run is complete before its last shot, or "".
-        is_given_up: Whether the disk did not answer, so that nothing more is written.
+        is_given_up: True if the disk did not answer, so that nothing more is written.
     """
 
     def __init__(self, run_dir: Path, run: RunRecord, stop: StopFlag | None = None) -> None:
@@ -69,7 +69,7 @@ class RunWriter:
         self._events_lock = threading.Lock()
         self._n_events_lost = 0
         self._began_s = time.monotonic()
-        # run.json, if another process began the run: its settings are those of the first shots
+        # run.json, if another process began the run, because its settings are those of the first shots
         self._before: dict[str, Any] | None = None
         self._existing_files: frozenset[str] = frozenset()
 
@@ -86,7 +86,7 @@ class RunWriter:
         Several processes may call it at the same time.
 
         Args:
-            root: Data root; created if it does not exist.
+            root: Data root. Created if it does not exist.
             run: The record of the run before its devices are open.
             extra_files: Further files for the folder: name -> content.
             stop: The request to stop the run.
@@ -98,7 +98,7 @@ class RunWriter:
         try:
             with explained(run_dir):
                 make_folder(run_dir / folders.SHOTS_FOLDER)
-            # run.json comes last: without one, a folder holds no shots and may be deleted
+            # run.json comes last, because a folder without one holds no shots and may be deleted
             write_file(run_dir / folders.STATE_FILE, encode_state("running"))
             texts = {folders.SEQUENCE_FILE: run.sequence_text, folders.PROFILE_FILE: run.profile_text}
             for name, content in {**texts, **(extra_files or {})}.items():
@@ -116,12 +116,12 @@ class RunWriter:
     def reopen(
         cls, run_dir: Path, run: RunRecord, *, n_written: int, stop: StopFlag | None = None
     ) -> RunWriter:
-        """Resume a run that ended before its last shot; no other process may write to it.
+        """Resume a run that ended before its last shot. No other process may write to it.
 
         Args:
-            run: Its current record, for the files of the next shots; only ``resumed`` is written to run.json,
-                and what follows from the number of shots if that has grown. All other settings there are
-                those of the first shots; changes that were accepted are in ``resumed``.
+            run: Its current record, for the files of the next shots. In run.json, only ``resumed`` changes,
+                and settings that follow from the number of shots if that has grown. All other settings there
+                stay those of the first shots. ``resumed`` contains changes that were accepted.
             n_written: Number of shots written before that count.
             stop: The request to stop the run.
 
@@ -135,7 +135,7 @@ class RunWriter:
                 before[name] = {**before[name], "shots": getattr(run, name)["shots"]}
         with explained(run_dir):
             (run_dir / folders.STOP_FILE).unlink(missing_ok=True)
-            # all files, as one may have been written without its line in the index
+            # all files, because one may have been written without its line in the index
             existing = frozenset(path.name for path in (run_dir / folders.SHOTS_FOLDER).iterdir())
         writer = cls(run_dir, run, stop)
         writer.n_written, writer._before, writer._existing_files = n_written, before, existing
@@ -145,12 +145,12 @@ class RunWriter:
 
     @property
     def last_row(self) -> IndexRow:
-        """The attempt that was written last, as the index lists it; there must be one."""
+        """The last attempt that was written, as the index lists it. There must be one."""
         assert self._last_row is not None
         return self._last_row
 
     def set_devices(self, devices: Mapping[str, Mapping[str, Any]]) -> None:
-        """Add the descriptions of the devices; called before the first shot, when they are open.
+        """Add the descriptions of the devices. Call it before the first shot, when they are open.
 
         Raises:
             RecordingError: The disk is full.
@@ -164,7 +164,7 @@ class RunWriter:
         self._on_disk(self._write_run_file)()
 
     def _write_run_file(self) -> None:
-        """Write run.json; for a resumed run, as the first process wrote it."""
+        """Write run.json. For a resumed run, it stays as the first process wrote it."""
         if self._before is None:
             data = encode_run(self.run, run_id_of(self.run_dir))
         else:
@@ -177,10 +177,10 @@ class RunWriter:
         return ShotEncoder(self.run, run_id_of(self.run_dir))
 
     def write_shot(self, shot: ShotRecord) -> IndexRow:
-        """Write an attempt at a shot; it counts if it is complete.
+        """Write an attempt at a shot. It counts if it is complete.
 
         Returns:
-            The attempt as the index lists it; its file and its line are on the disk.
+            The attempt as the index lists it. Its file and its line are on the disk.
 
         Raises:
             RecordingError: The disk is full, or the record contradicts itself.
@@ -204,7 +204,7 @@ class RunWriter:
         return row
 
     def _write_shot(self, row: IndexRow, data: memoryview, sha256: SimpleQueue[str]) -> IndexRow:
-        """Write the file of an attempt, then its line in the index; returns that."""
+        """Write the file of an attempt, then its line in the index. Return that line."""
         path = self.run_dir / row.file
         with self._guard.step(f"{path.name} ", ANSWER_S, "disk"):
             write_file(path, data)
@@ -214,16 +214,16 @@ class RunWriter:
         return row
 
     def _on_disk(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Callable[[], T]:
-        """Begin to write something; returns a function that waits until it is written.
+        """Begin to write something, and return a function that waits until it is written.
 
         Raises:
-            RecordingError: The disk does not answer; or as ``work`` raises it.
+            RecordingError: The disk does not answer, or ``work`` raised it.
             StopRequested: The run was asked to stop twice.
         """
         no_answer = RecordingError(self.run_dir, "cannot be written: the disk does not answer")
         if self.is_given_up:
             raise no_answer
-        # twice the limit, as a shot is two files: its own and the index
+        # twice the limit, because a shot is written to two files, its own and the index
         _, result = self._guard.begin("disk", 2 * ANSWER_S, partial(work, *args, **kwargs), is_patient=False)
 
         def wait() -> T:
@@ -253,11 +253,11 @@ class RunWriter:
             sync_folder(self.run_dir)  # the file may not exist yet
 
     def place_of(self, shot_index: int) -> dict[str, str]:
-        """Where a shot will be recorded if it counts: the folder of the "run", and in it the "file"."""
+        """Where a shot will be recorded if it counts: the folder "run" and the "file" in it."""
         return {"run": str(self.run_dir), "file": self._free_name(shot_index, 0, counts=True)}
 
     def _free_name(self, shot_index: int, attempt: int, *, counts: bool) -> str:
-        """The name of a shot's file, different from those that the run had before it was resumed."""
+        """The name of a shot's file, different from names that the run had before it was resumed."""
         for take in itertools.count(1):
             file = folders.shot_file_name(shot_index, attempt, counts=counts, take=take)
             if Path(file).name not in self._existing_files:
@@ -265,9 +265,9 @@ class RunWriter:
         raise AssertionError
 
     def event(self, name: str, /, **values: Any) -> None:
-        """Add a line to the event log; never raises, from any thread.
+        """Add a line to the event log. Never raises, from any thread.
 
-        A line that cannot be written is lost; the next line says how many were.
+        A line that cannot be written is lost. The next line says how many were.
         """
         line: dict[str, Any] = {
             "t_utc": now_utc(),
@@ -281,7 +281,7 @@ class RunWriter:
             if self._n_events_lost:
                 line["n_lost_before"] = self._n_events_lost
             try:
-                self._events.append(line, sync=False)  # a lost event is no lost shot: not worth a sync
+                self._events.append(line, sync=False)  # losing an event is harmless, so no sync
                 self._n_events_lost = 0
             except RecordingError:
                 self._n_events_lost += 1
@@ -301,11 +301,11 @@ class RunWriter:
     def _finish(self, status: RunStatus, error: str) -> None:
         with suppress(OSError):
             (self.run_dir / folders.STOP_FILE).unlink(missing_ok=True)
-        # the state comes last: a reader that sees it finds all other lines
+        # the state comes last, so that a reader that sees it finds all other lines
         self.event("run_finished", status=status, error=error, n_shots=self.n_written)
         write_file(self.run_dir / folders.STATE_FILE, encode_state(status, error, self.ended_early))
 
 
 def run_id_of(run_dir: Path) -> str:
-    """The id of a run: the names of its last two folders."""
+    """The id of a run, which consists of the names of its last two folders."""
     return f"{run_dir.parent.name}/{run_dir.name}"

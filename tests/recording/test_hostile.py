@@ -147,8 +147,8 @@ def many_parts(file: Any, secret: Path) -> None:
 @pytest.mark.parametrize(
     ("plant", "what"),
     [
-        (huge, "/entry/detection/occupancy declares 17592186044416 bytes, and the file has "),
-        (compressed_huge, "/entry/camera/camera/frames declares 2199023255552 bytes, and the file has "),
+        (huge, "/entry/detection/occupancy declares 17592186044416 bytes, but the file has "),
+        (compressed_huge, "/entry/camera/camera/frames declares 2199023255552 bytes, but the file has "),
         (external_link, "/entry/target is a link that leads elsewhere"),
         (soft_link, "/entry/target is a link that leads elsewhere"),
         (external_storage, "/entry/target/fill keeps its data in another file"),
@@ -244,7 +244,7 @@ def test_a_line_of_the_index_that_leads_elsewhere_is_no_shot(run_dir: Path, chan
     edit_index(run_dir, lambda lines: [*lines[:4], json.dumps({**json.loads(lines[4]), **changes}).encode()])
     run = open_run(run_dir)
     assert (len(run.shots), run.n_damaged_lines) == (N_SHOTS - 1, 1)
-    assert "a line of the index is not a shot's" in {
+    assert "a line of the index describes no shot" in {
         one.what for one in examine(run_dir, dry_run=True).findings
     }
 

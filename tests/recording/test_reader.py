@@ -184,7 +184,7 @@ def test_a_run_of_a_newer_labseq_is_refused(run_dir: Path) -> None:
     ("attributes", "message"),
     [
         ({"format_version": "5.0"}, r"has format version 5\.0, this labseq reads 4\.2; update labseq"),
-        ({"format_version": "x"}, "has the format version 'x'; expected one like 4.2"),
+        ({"format_version": "x"}, "has the format version 'x'; expected a version like 4.2"),
         ({"format": "nexus"}, "is not a shot's file of labseq"),
     ],
 )

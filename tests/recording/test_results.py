@@ -71,7 +71,7 @@ def test_what_is_no_result_is_refused(result):
         (np.zeros(3, np.complex128), "'x' is of the type array of complex128; .*two names"),
         ({"a": [1, {"b": object()}]}, "'x', 'a', number 1, 'b' is of the type object; expected numbers"),
         (np.zeros(3, [("a", "f8")]), "array of void"),
-        ([0.5] * 300_000, r"the result is 1\.5 MB of text, .*return arrays of numpy"),
+        ([0.5] * 300_000, r"the result has 1\.5 MB of text, .*return numpy arrays"),
     ],
 )
 def test_a_value_of_the_wrong_type_is_refused_where_it_is(value, words):

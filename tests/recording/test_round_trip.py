@@ -223,7 +223,9 @@ def test_frames_that_were_compressed_later_come_back(tmp_path: Path, monkeypatch
         camera.create_dataset("frames", data=frames, **hdf5plugin.Bitshuffle(cname="lz4"))
     assert_same(found.record(), shot)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    with pytest.raises(RecordingError, match=re.escape(f"hdf5plugin is needed; {install_hint('compress')}")):
+    with pytest.raises(
+        RecordingError, match=re.escape(f"need hdf5plugin to be read; {install_hint('compress')}")
+    ):
         _ = found.frames
 
 
