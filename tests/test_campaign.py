@@ -168,7 +168,7 @@ def test_a_folder_is_used_by_one_command_and_by_runs_of_the_same_files(file: Pat
         run_in_turn(running(2), campaign, folder)
     sequence = campaign.sequence.read_text(encoding="utf-8")
     campaign.sequence.write_text(f"{sequence}# another text\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match="taken with another text of the sequence or the profile"):
+    with pytest.raises(ConfigError, match="taken with a different sequence or profile file"):
         run_in_turn(running(9), campaign, folder)
     campaign.sequence.write_text(sequence, encoding="utf-8")
     held = []
@@ -267,7 +267,7 @@ def test_an_alarm_ends_its_run_and_not_the_campaign(
     assert table[0][2:] == ["shots", "loading", "runs"]
     assert [row[3:5] for row in table[1:]] == [["4", "0"], [str(repeats), table[2][4]]]
     assert "alarm 'atoms' in 2 shots in a row" in err
-    assert "in all, alarms ended 1 of 2 runs" in err
+    assert "; alarms ended 1 of 2 runs" in err
     # one that has all its shots is over; the shots that are left are taken now
     assert left_with(*command) == 0
     dark = all_runs(folder)[0]

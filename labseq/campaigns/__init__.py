@@ -1,1 +1,1 @@
-"""Campaigns: many runs of a sequence, by this computer or a cluster, and read as one."""
+"""Campaigns: many runs of a sequence, taken by this computer or a cluster, and read as one."""

@@ -33,7 +33,7 @@ Point = tuple[int, ...]
 
 
 class CampaignSettings(Settings):
-    """A campaign file."""
+    """The content of a campaign file."""
 
     labseq: Literal[1]
     sequence: str = Field(
@@ -41,15 +41,15 @@ class CampaignSettings(Settings):
     )
     profile: str | None = Field(default=None, description="hardware profile, instead of the sequence's own")
     axes: dict[str, list[Any]] = Field(
-        default={}, description="address, as for --set, and its values; every combination is a point"
+        default={}, description="address, as for --set, and its values, of which every combination is a point"
     )
     repeats: int = Field(default=1, ge=1, description="shots at each point")
     runs: int = Field(
         default=1,
         ge=1,
-        description="runs that share the shots of a point, each with a seed made from that of the campaign",
+        description="runs that share the shots of a point, each with a seed made from the campaign's seed",
     )
-    seed: int | None = Field(default=None, ge=0, description="seed of all runs; by default each has its own")
+    seed: int | None = Field(default=None, ge=0, description="seed of all runs (default: each has its own)")
 
 
 class PlannedRun(NamedTuple):
@@ -57,7 +57,7 @@ class PlannedRun(NamedTuple):
 
     Attributes:
         point: Its point.
-        options: The options that it is opened with.
+        options: The options with which it is opened.
     """
 
     point: Point
@@ -83,10 +83,10 @@ class Campaign:
         """Read a campaign file.
 
         Args:
-            text: Its text, if it need not be read here.
+            text: Its text, if it is already known.
 
         Raises:
-            ConfigError: It has an error, with its place.
+            ConfigError: The file has an error. The message gives its place.
         """
         document = Document.read(path, None if text is None else StoredText(text, str(path)))
         settings = document.validate(CampaignSettings, ())
@@ -103,7 +103,7 @@ class Campaign:
             what = f"{settings.runs} runs cannot share {settings.repeats} shots"
             raise document.error(("runs",), what, "at most 'repeats'")
         if settings.runs > 1 and settings.seed is None:
-            what = "'seed' is missing; the seeds of the runs are made from it"
+            what = "'seed' is missing, from which the seeds of the runs are made"
             raise document.error(("runs",), what, "'seed: 1', or another whole number")
         return cls(document, settings, axes)
 
@@ -114,7 +114,7 @@ class Campaign:
         return path if path.is_file() else Path(self.settings.sequence)
 
     def points(self) -> Iterator[Point]:
-        """The indices of the values of each point; the last axis changes fastest."""
+        """The indices of the values of each point. The last axis changes fastest."""
         yield from itertools.product(*(range(len(values)) for values in self.axes.values()))
 
     def values(self, point: Point) -> list[str]:
@@ -146,7 +146,7 @@ class Campaign:
         """Check that the sequence and the profile exist.
 
         Raises:
-            ConfigError: One does not exist; with its place in this file.
+            ConfigError: A file does not exist. The message gives its place in this file.
         """
         finds = {
             "sequence": lambda: read_bytes(find_sequence(self.sequence)),
@@ -161,7 +161,7 @@ class Campaign:
                 raise self.document.error((name,), problem.what, problem.expected, problem.hint) from error
 
     def placed(self, error: ConfigError, run: PlannedRun) -> ConfigError:
-        """An error of a run; if a value of the campaign file causes it, with the place of that value."""
+        """An error of a run, with its place in the campaign file if a value there causes it."""
         return ConfigError([self._placed(problem, run) for problem in error.problems])
 
     def _placed(self, problem: Problem, run: PlannedRun) -> Problem:
@@ -179,9 +179,9 @@ def run_folders(folder: Path) -> list[Path]:
 
 
 def recorded_runs(folder: Path) -> tuple[Campaign, dict[Point, list[Run]]]:
-    """The campaign of a folder, and the runs that it has so far: point -> its runs.
+    """The campaign of a folder, and its runs so far: point -> its runs.
 
-    Of two runs with the same shots, the one with more shots counts: a cluster takes a run again if the
+    Of two runs with the same shots, the run with more shots counts. A cluster takes a run again if the
     computer that started it has disappeared.
 
     Raises:
@@ -197,7 +197,7 @@ def recorded_runs(folder: Path) -> tuple[Campaign, dict[Point, list[Run]]]:
         run = open_run(path)
         key = _shots_of([run.changes.get(address, "") for address in campaign.axes], run.changes)
         if key not in planned:
-            what = f"this run belongs to no point of {CAMPAIGN_FILE}, which may have been changed since"
+            what = f"this run belongs to no point of {CAMPAIGN_FILE}, which may have been changed"
             raise ConfigError(Problem(what, visible(str(run.path))))
         if key not in best or len(run.shots) > len(best[key].shots):
             best[key] = run
@@ -210,5 +210,5 @@ def recorded_runs(folder: Path) -> tuple[Campaign, dict[Point, list[Run]]]:
 
 
 def _shots_of(values: Sequence[str], changes: Mapping[str, str]) -> tuple[tuple[str, ...], str | None]:
-    """What determines the shots of a run within a campaign: the values of its axes, and its seed."""
+    """The values that determine the shots of a run in a campaign: those of its axes, and its seed."""
     return tuple(values), changes.get("seed")

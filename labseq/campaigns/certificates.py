@@ -14,20 +14,20 @@ from labseq.messages import install_hint, visible
 from labseq.plain import now
 
 DAYS: Final = 730
-"""How long the certificates are valid."""
+"""How many days the certificates are valid."""
 
 
 def make_certificates(folder: Path) -> list[Path]:
     """Make an authority, and a certificate with its key for scheduler, workers and clients.
 
-    The key of the authority is not stored: another certificate means making all of them again. Existing
+    The key of the authority is not stored, so a further certificate means making all of them again. Existing
     files are not replaced.
 
     Args:
-        folder: Where they are written; created if it does not exist, and closed to other users.
+        folder: Where they are written. Created if it does not exist, and closed to other users.
 
     Returns:
-        The files: ``ca.pem``, and for each role one with key and certificate.
+        The files: ``ca.pem``, and for each role a file with key and certificate.
 
     Raises:
         ConfigError: One of the files exists, or the extra is not installed.
@@ -43,7 +43,7 @@ def make_certificates(folder: Path) -> list[Path]:
     roles = {"scheduler.pem": "scheduler", "worker.pem": "worker", CLIENT_FILE: "client"}
     paths = [folder / name for name in (CA_FILE, *roles)]
     if taken := [path for path in paths if path.exists()]:
-        what = "this file already exists; nothing was written"
+        what = "this file already exists, so nothing was written"
         raise ConfigError(Problem(what, visible(str(taken[0])), expected="a folder without certificates"))
     with explained(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -69,7 +69,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _certificate(name: str, key: Any, signer: Any, root: Any) -> Any:
-    """A certificate; that of the authority itself if it has no signer."""
+    """A certificate. Without a signer, it is the certificate of the authority itself."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes
 

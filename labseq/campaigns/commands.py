@@ -1,4 +1,4 @@
-"""Commands for campaigns: run one, make the certificates of a cluster."""
+"""Commands for campaigns: run one, and make the certificates of a cluster."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 campaign = typer.Typer(
     name="campaign",
     help="Many runs of a sequence, by this computer or a cluster.",
-    short_help="Many runs of a sequence; certificates of a cluster.",
+    short_help="Many runs of a sequence, and certificates of a cluster.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -29,7 +29,7 @@ def keys(
 ) -> None:
     """Make the certificates by which scheduler, workers and clients of a dask cluster recognise each other.
 
-    Anyone who has one of the files can run any code on the cluster: copy them only to its machines.
+    Anyone who has one of the files can run any code on the cluster, so copy them only to its machines.
     """
     from labseq.campaigns.certificates import DAYS, make_certificates
     from labseq.console.output import say
@@ -58,13 +58,13 @@ def run_file(
     """Take the runs of a campaign file, and print a table.
 
     Args:
-        run_session: Runs a session and shows it; for runs that are taken one after the other.
+        run_session: Runs and shows a session, for runs that are taken one after the other.
         file: The file.
         folder: The campaign's folder.
-        n_workers: Number of runs at a time, each by a process of its own.
-        scheduler: Address of a dask cluster that takes them instead.
+        n_workers: Number of simultaneous runs, each in its own process.
+        scheduler: Address of a dask cluster that takes the runs instead.
         cluster_keys: Folder of its certificates.
-        results_of: Some runs -> what they measure: name -> mean, as text.
+        results_of: Some runs -> their results: name -> mean, as text.
 
     Raises:
         AlarmError: Alarms ended some of the runs.
@@ -91,7 +91,7 @@ def run_file(
     n_runs = plural(sum(map(len, runs.values())), "run")
     say("", *aligned(_rows(wanted, runs, results_of)), f"{n_runs} in {folder}")
     if alarms:
-        text = f"{alarms[0].text}; in all, alarms ended {len(alarms)} of {n_runs}, the others went on"
+        text = f"{alarms[0].text}; alarms ended {len(alarms)} of {n_runs}, and the others continued"
         raise AlarmError(alarms[0].alarm, text, alarms[0].n_shots)
 
 
@@ -100,7 +100,7 @@ def _rows(
     runs: Mapping[Point, Sequence[Run]],
     results_of: Callable[[Sequence[Run]], Mapping[str, str]],
 ) -> list[tuple[str, ...]]:
-    """A row for each point of a campaign, with what its runs measure, below the heads of the columns."""
+    """A row for each point of a campaign, with the results of its runs, below the heads of the columns."""
     results = {point: results_of(runs[point]) for point in wanted.points()}
     names = [*dict.fromkeys(name for means in results.values() for name in means)]
     rows: list[tuple[str, ...]] = [(*wanted.axes, "shots", *names, "runs")]
@@ -113,7 +113,7 @@ def _rows(
 def _reporter(
     wanted: Campaign, results_of: Callable[[Sequence[Run]], Mapping[str, str]]
 ) -> Callable[[PlannedRun, Run], None]:
-    """Prints a line for each run that is over."""
+    """Make a function that prints a line for each run that is over."""
     from labseq.console.output import say
 
     def report(planned: PlannedRun, run: Run) -> None:
@@ -131,6 +131,6 @@ def _n_shots(runs: Sequence[Run]) -> str:
 
 
 def _names(runs: Sequence[Run]) -> str:
-    """The names of some runs: of the first, and of the last."""
+    """The names of some runs: the first and the last."""
     names = [f"{run.path.parent.name}/{run.path.name}" for run in runs]
     return " to ".join(dict.fromkeys([*names[:1], *names[-1:]]))

@@ -1,4 +1,4 @@
-"""Takes the runs of a campaign: one after the other, or several at a time by processes or a cluster."""
+"""Takes the runs of a campaign one after the other, or several at a time by processes or a cluster."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from labseq.workers import POLL_S, Workers, portable
 RunSession: TypeAlias = "Callable[[Callable[[RunObserver | None], Session]], None]"
 """Runs the session that a function opens with an observer."""
 Missing: TypeAlias = "list[tuple[PlannedRun, Path | None]]"
-"""Runs to take, and the folder of the one that was begun, to be resumed."""
+"""Runs to take, each with the folder of an earlier start that is to be resumed."""
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignInputs:
-    """The files and plugins that the runs of a campaign would be made from now.
+    """The files and plugins from which the runs of a campaign would be made now.
 
     Attributes:
         texts: Point -> SHA-256 of the texts of sequence and profile.
@@ -50,10 +50,10 @@ def check_campaign(campaign: Campaign, *, in_turn: bool) -> CampaignInputs:
     """Check the sequence at every point, before the first run, and compile its kernels.
 
     Args:
-        in_turn: Whether the runs are taken one after the other; otherwise all hardware must be simulated.
+        in_turn: Whether the runs are taken one after the other. Otherwise all hardware must be simulated.
 
     Raises:
-        ConfigError: The sequence has an error; if a value of the campaign file causes it, with its place.
+        ConfigError: The sequence has an error. The message has its place if the campaign file causes it.
     """
     campaign.find_files()
     plugins, texts = set[tuple[str, ...]](), dict[Point, tuple[str, str]]()
@@ -71,7 +71,7 @@ def check_campaign(campaign: Campaign, *, in_turn: bool) -> CampaignInputs:
             expected = "simulated hardware, to take several runs at once"
             raise ConfigError(Problem(what, expected=expected, hint="leave out --workers and --scheduler"))
         if not in_turn and not texts:
-            session.warm(session.build_lab())  # once here, or each worker would compile the same kernels
+            session.warm(session.build_lab())  # here, because each worker would compile the same kernels
         documents = assembly.document, assembly.hardware.document
         sequence, profile = (sha256_of_text(document.text) for document in documents)
         texts[run.point] = sequence, profile
@@ -85,10 +85,10 @@ def _plugins(assembly: Any) -> set[tuple[str, ...]]:
 
 @contextmanager
 def campaign_folder(campaign: Campaign, folder: Path, inputs: CampaignInputs) -> Generator[Missing]:
-    """Lock a campaign's folder, which is created if necessary, and give the runs that are missing in it.
+    """Lock a campaign's folder, creating it if necessary, and give the runs that it lacks.
 
     Raises:
-        ConfigError: Another process uses it; or its runs belong to other files or another campaign.
+        ConfigError: Another process uses it, or its runs belong to other files or another campaign.
         RecordingError: A run is damaged, or the folder cannot be written to.
     """
     lock = Lock(folder / LOCK_FILE, "labseq campaign run")
@@ -110,12 +110,12 @@ def _missing(campaign: Campaign, folder: Path, inputs: CampaignInputs) -> Missin
         run = open_run(path)
         key = tuple(run.changes.items())
         if key not in planned:
-            what = "this run belongs to no point of the campaign, which may have been changed since"
+            what = "this run belongs to no point of the campaign, which may have been changed"
             raise ConfigError(Problem(what, visible(str(run.path)), expected="another folder"))
         texts = run.record.get("sequence_sha256"), run.record.get("profile_sha256")
         if texts != inputs.texts[planned[key].point]:
-            what = "this run was taken with another text of the sequence or the profile"
-            expected, hint = "another folder", "or the files as they were, which are in the run's folder"
+            what = "this run was taken with a different sequence or profile file"
+            expected, hint = "another folder", "or restore these files from the run's folder"
             raise ConfigError(Problem(what, visible(str(run.path)), expected=expected, hint=hint))
         if (key not in best or not is_over(best[key])) and not _is_elsewhere(run.path):
             best[key] = run
@@ -132,7 +132,7 @@ def _key(run: PlannedRun) -> tuple[tuple[str, str], ...]:
 
 
 def _is_elsewhere(run_dir: Path) -> bool:
-    """Whether a run was started by another computer and has not ended: that may still write to the folder."""
+    """Whether a run of another computer has not ended, so that the computer may still write to it."""
     owner = read_owner(run_dir)
     return is_running(run_dir) and owner is not None and not owner.is_here
 
@@ -166,11 +166,11 @@ def run_in_turn(run_session: RunSession, campaign: Campaign, folder: Path) -> li
     """Take the missing runs of a campaign one after the other.
 
     Returns:
-        The alarms that ended runs: the others may well have atoms.
+        The alarms that ended runs. The others may well have atoms.
 
     Raises:
         ConfigError: The campaign has an error, or the runs in the folder belong to another one.
-        LabseqError: A run failed; the same command continues the campaign.
+        LabseqError: A run failed. The same command continues the campaign.
     """
     alarms: list[AlarmError] = []
     with campaign_folder(campaign, folder, check_campaign(campaign, in_turn=True)) as missing:
@@ -188,7 +188,7 @@ def run_in_turn(run_session: RunSession, campaign: Campaign, folder: Path) -> li
 
 @dataclass(frozen=True, slots=True)
 class WorkerTask:
-    """The campaign as it is sent to a worker.
+    """A campaign in the form in which it is sent to a worker.
 
     Attributes:
         file: The campaign file.
@@ -204,7 +204,7 @@ class WorkerTask:
 
 
 class RunTaker:
-    """Takes runs of a campaign in a process of its own.
+    """Takes runs of a campaign in its own process.
 
     Raises:
         ConfigError: This computer does not see the campaign's folder.
@@ -238,7 +238,7 @@ class RunTaker:
             return str(session.run_dir), None
 
     def _earlier(self, run: PlannedRun) -> Path | None:
-        """The folder of a run that was started here before: by a worker that died, or an earlier command."""
+        """The folder of a run that was started here before, by a worker that died or an earlier command."""
         for path in reversed(run_folders(self._task.folder)):
             earlier = open_run(path)
             is_open = not is_over(earlier) and not _is_elsewhere(path)
@@ -255,16 +255,16 @@ def run_at_once(
     If a worker dies, another one resumes its run.
 
     Args:
-        workers: The workers; closed at the end.
+        workers: The workers. They are closed at the end.
         report: Called with each run that is complete, or was ended by an alarm.
 
     Returns:
-        The alarms that ended runs: the others may well have atoms.
+        The alarms that ended runs. The others may well have atoms.
 
     Raises:
         ConfigError: The campaign has an error, or the runs in the folder belong to another one.
-        StopRequested: Ctrl-C or SIGTERM; the runs in progress are stopped; the same command resumes them.
-        LabseqError: A run failed; the same command continues the campaign.
+        StopRequested: Ctrl-C or SIGTERM. Stops the runs in progress, and the same command resumes them.
+        LabseqError: A run failed. The same command continues the campaign.
     """
     stop = StopFlag()
     with closing(workers), stop_on_signals(stop):
@@ -279,7 +279,7 @@ def run_at_once(
             try:
                 return _share_out(remaining, workers, report, stop)
             finally:
-                # also those on other computers, which no signal reaches
+                # also runs on other computers, which no signal reaches
                 for path in filter(is_running, run_folders(folder) if remaining else ()):
                     ask_to_stop(path)
 
@@ -301,7 +301,7 @@ def _share_out(
             if isinstance(error, AlarmError):
                 alarms.append(error)
             elif error is not None:
-                stop.check()  # Ctrl-C reaches the workers too: their errors are no failures then
+                stop.check()  # Ctrl-C reaches the workers too, and their errors are then not failures
                 raise error
             report(remaining.pop(number), open_run(run_dir))
             n_out -= 1

@@ -1,4 +1,4 @@
-"""Occupancies drawn as text: one character per site, or one per two rows of sites."""
+"""Occupancies drawn as text, with one character per site or per two rows of sites."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from labseq.console.text import encodes
 from labseq.model import Occupancy, TargetPattern
 
 EMPTY, RESERVOIR, SURPLUS, ATOM, DEFECT = range(5)
-"""State of a site: empty; an atom outside of the target, where none is allowed, or on a target site; or a
-target site without an atom."""
+"""State of a site. RESERVOIR is an atom outside the target, SURPLUS an atom where none is allowed, ATOM an
+atom on a target site, and DEFECT a target site without an atom."""
 
 _COLOURS: Final = ("default", "bright_black", "yellow", "green", "red")
 _STYLES: Final = tuple(Style(color=colour, bold=i == DEFECT) for i, colour in enumerate(_COLOURS))
@@ -25,12 +25,12 @@ _STYLES: Final = tuple(Style(color=colour, bold=i == DEFECT) for i, colour in en
 
 @dataclass(frozen=True, slots=True)
 class Glyphs:
-    """The characters to draw with.
+    """The characters with which arrays are drawn.
 
     Attributes:
         sites: One character for each of EMPTY, RESERVOIR, SURPLUS, ATOM and DEFECT.
         levels: A cell that is filled from below, from the lowest level to the whole cell.
-        blocks: Upper half, lower half and whole cell; "" without half blocks.
+        blocks: Upper half, lower half and whole cell. "" without half blocks.
     """
 
     sites: str
@@ -65,13 +65,13 @@ class Scale:
     rows: int
 
     def size(self, n_rows: int, n_cols: int, shear: int) -> tuple[int, int]:
-        """Width and height of the drawing in characters; ``shear`` as for :func:`draw_array`."""
+        """Width and height of the drawing in characters. ``shear`` is as for :func:`draw_array`."""
         return n_cols * self.cell + self.indent(0 if shear < 0 else n_rows - 1, n_rows, shear), -(
             -n_rows // self.rows
         )
 
     def indent(self, row: int, n_rows: int, shear: int) -> int:
-        """Number of characters by which a row is shifted to the right: half a site per row."""
+        """Number of characters by which a row is shifted to the right, which is half a site per row."""
         last = n_rows - 1
         return abs(shear) * (
             row * self.cell // 2 if shear > 0 else last * self.cell // 2 - row * self.cell // 2
@@ -118,7 +118,7 @@ def _site_line(row: list[int], cell: int, glyphs: Glyphs) -> Text:
 
 
 def _half_line(upper: list[int], lower: list[int], glyphs: Glyphs) -> Text:
-    """Two rows of sites on one line: the upper one in the text's colour, the lower one behind it."""
+    """Two rows of sites on one line, the upper row in the text's colour and the lower row behind it."""
     half_upper, half_lower, whole = glyphs.blocks
     line = Text(no_wrap=True)
     for (a, b), sites in groupby(zip(upper, lower, strict=True)):
@@ -129,7 +129,7 @@ def _half_line(upper: list[int], lower: list[int], glyphs: Glyphs) -> Text:
 
 
 _GAP: Final = 4
-"""Characters between two arrays."""
+"""Number of characters between two arrays."""
 _MIN_WIDTH: Final = len("before")
 """Minimum width of an array in characters."""
 
@@ -146,13 +146,13 @@ _KEY: Final = {
 
 @dataclass(frozen=True, slots=True)
 class ArrayPair:
-    """Draws two arrays of one grid, before and after, with numbered rows and columns.
+    """Draws two arrays on the same grid, before and after, with numbered rows and columns.
 
     Attributes:
         target: The target.
-        shear: As in :class:`labseq.model.SiteGrid`; 0 on a square lattice.
-        width: Characters per line.
-        glyphs: The characters to draw with.
+        shear: As in :class:`labseq.model.SiteGrid`. 0 on a square lattice.
+        width: Number of characters per line.
+        glyphs: The characters with which to draw.
     """
 
     target: TargetPattern
@@ -166,7 +166,7 @@ class ArrayPair:
         arrays: Sequence[Occupancy],
         marked: Sequence[Sites] = (_NOWHERE, _NOWHERE),
     ) -> list[Text]:
-        """Draw two arrays as large as possible; returns only a note if there is no room.
+        """Draw two arrays as large as possible. Return only a note if there is no room.
 
         Args:
             titles: The titles above the arrays.
@@ -191,7 +191,7 @@ class ArrayPair:
         return lines
 
     def key(self, *arrays: Occupancy) -> Text:
-        """Explain the characters that occur in these arrays; empty if there are none."""
+        """Explain the characters that occur in these arrays. Empty if there are none."""
         if self._arrangement[1] is None:
             return Text()
         shown = {int(kind) for array in arrays for kind in np.unique(site_kinds(array, self.target))}
@@ -204,7 +204,7 @@ class ArrayPair:
 
     @property
     def _arrangement(self) -> tuple[bool, Scale | None]:
-        """Whether the arrays are drawn side by side, and the scale; None if they do not fit."""
+        """Whether the arrays are drawn side by side, and the scale. None if they do not fit."""
         widths = [(scale, scale.size(*self.target.shape, self.shear)[0]) for scale in (ROOMY, DENSE)]
         for beside in (True, False):
             for scale, width in widths:

@@ -1,4 +1,4 @@
-"""Errors on the terminal: the excerpt of the file with its caret, and exit codes."""
+"""Errors on the terminal: the faulty line of a file with a caret below it, and exit codes."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _WORD: Final = re.compile(rf"\"[^\"]*\"?|'[^']*'?|{_PLAIN}(?: (?!#){_PLAIN})*")
 
 
 def excerpt(problem: Problem) -> list[str]:
-    """Show the line, or the option, of a problem as compilers do.
+    """Show the line or option of a problem as compilers do.
 
     Returns:
-        The line with its number, and a line with carets below the offending word; nothing if the problem
+        The line with its number, and a line with carets below the wrong word. Empty if the problem
         has no column, or its file cannot be read.
     """
     from rich.cells import cell_len
@@ -76,18 +76,18 @@ EXIT_INTERRUPTED: Final = EXIT_SIGNALLED + 2
 EXIT_INTERNAL: Final = 1
 EXIT_CODES: Final = {
     "0": "done",
-    "1": "the plan or the data: a planner failed or broke a rule, the disk is full; or labseq itself failed",
+    "1": "a planner failed or broke a rule, the disk is full, or labseq itself failed",
     "2": "a mistake in a file, an option or a setting, or a request that exceeds a limit",
     "3": "a device failed, did not answer, or could not be made safe",
-    "129, 130, 143": "stopped because the terminal was closed; by Ctrl-C; by SIGTERM or `labseq stop`",
+    "129, 130, 143": "stopped because the terminal was closed, by Ctrl-C, or by SIGTERM or `labseq stop`",
 }
 """Exit codes of the commands -> meaning."""
 MAX_REPORTED: Final = 50
-"""Problems of a file that are printed; a file with more of them is probably not a file of labseq."""
+"""Maximum number of problems of a file that are printed. A file with more is probably not for labseq."""
 
 
 def report(error: BaseException, *, debug: bool = False) -> int:
-    """Print on stderr what went wrong, with the traceback if wanted.
+    """Print an error on stderr, with the traceback if ``debug``.
 
     Returns:
         The exit code.
@@ -101,13 +101,13 @@ def report(error: BaseException, *, debug: bool = False) -> int:
 
 
 def _traceback(error: BaseException) -> list[str]:
-    """The traceback of an error; a text in it may be very long, or have control characters."""
+    """The traceback of an error. Its text may be very long, or contain control characters."""
     parts = traceback.format_exception(error)
     return [visible(line) for part in parts for line in part[:MAX_ERROR].splitlines()]
 
 
 def format_config_error(error: ConfigError) -> list[str]:
-    """Every problem with the line that it is in, and its notes; only the first of very many problems."""
+    """Every problem with its line and its notes, or only the first of very many problems."""
     lines: list[str] = []
     for problem, text in zip(error.problems[:MAX_REPORTED], lines_of(error), strict=False):
         lines += [text, *excerpt(problem), *(f"      = {note}" for note in problem.notes)]
@@ -116,18 +116,18 @@ def format_config_error(error: ConfigError) -> list[str]:
 
 
 def warning_lines(warning: Problem) -> list[str]:
-    """A warning about a place in a file, with the line that it is in."""
+    """A warning about a place in a file, with its line."""
     return [f"warning: {warning}", *excerpt(warning), *(f"      = {note}" for note in warning.notes)]
 
 
 def json_errors(error: BaseException) -> dict[str, Any]:
-    """Why a file was refused, as a report has it."""
+    """The errors of a refused file in the form of a report."""
     problems = error.problems if isinstance(error, ConfigError) else [Problem(t) for t in lines_of(error)]
     return {"problems": problems, "warnings": []}
 
 
 def lines_of(error: BaseException) -> list[str]:
-    """The message for the user; a problem in a file starts with its place, as compilers print it.
+    """The message for the user. A problem in a file starts with its place, as compilers print it.
 
     Example:
         >>> lines_of(ConfigError("a session runs once"))
@@ -145,7 +145,7 @@ def lines_of(error: BaseException) -> list[str]:
         case OSError(errno=errno.ENOSPC):
             return [f"error: {error.filename or 'output'} cannot be written: {error.strerror}"]
         case _:
-            advice = "please report it; run again with --debug to see where"
+            advice = "please report it with the traceback that --debug prints"
             return [f"internal error: {format_error(error)}; {advice}"]
 
 

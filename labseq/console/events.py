@@ -1,4 +1,4 @@
-"""What happens in a run, as lines of text."""
+"""The events of a run as lines of text."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ LASTING: Final = frozenset(
 )
 """Events that must stay on the screen above the live view."""
 PRINTED: Final = LASTING | {"shot_finished", "scan_point", "scan_ended"}
-"""Events that have a line where there is no live view."""
+"""Events that are printed as a line if there is no live view."""
 
 
 class LogLines:
-    """Implements ``RunObserver`` by printing a line per event.
+    """A ``RunObserver`` that prints a line per event.
 
     Args:
-        events: Names of the events that are printed; without a live view, also how each shot ended.
+        events: Names of the events that are printed. Without a live view, also how each shot ended.
     """
 
     def __init__(self, stream: TextIO, events: frozenset[str] = PRINTED) -> None:
@@ -51,7 +51,7 @@ class LogLines:
         self._results: list[MeasuredResults] = []
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Print the line of an event, if it has one, and results that have come since the last."""
+        """Print the line of an event, if it has one, and results that have arrived since the last event."""
         if name == "run_starting":
             self._run = values["record"]
             names = measured_in(values["record"].resolved) if "shot_finished" in self._events else ()
@@ -66,14 +66,14 @@ class LogLines:
                 say(*results.new(values.get("row")), stream=self._stream)
 
     def refresh(self) -> None:
-        """Do nothing: every line was printed at once."""
+        """Do nothing, because every line was printed at once."""
 
     def close(self) -> None:
-        """Do nothing: the terminal was not changed."""
+        """Do nothing, because the terminal was not changed."""
 
 
 class MeasuredResults:
-    """A result of an analysis that a run measures: it comes later than its shot, and has a line of its own.
+    """A measured result of an analysis, which comes later than its shot and has its own line.
 
     Args:
         run_dir: The run's folder.
@@ -88,10 +88,10 @@ class MeasuredResults:
         self._awaited: set[int] = set()
 
     def new(self, row: IndexRow | None = None) -> list[str]:
-        """The lines of shots whose results have come.
+        """The lines of shots whose results have arrived.
 
         Args:
-            row: A shot that is over, whose result is awaited from now on.
+            row: A finished shot, whose result is awaited from now on.
 
         Raises:
             RecordingError: The results cannot be read.
@@ -115,7 +115,7 @@ def event_text(  # noqa: C901 - a case for each event
     """Describe an event on one line.
 
     Returns:
-        "" for an event that is not printed.
+        "" if the event is not printed.
     """
     match name:
         case "run_starting":
@@ -158,14 +158,14 @@ def event_text(  # noqa: C901 - a case for each event
 
 
 def ended_text(values: Mapping[str, Any]) -> str:
-    """A line about a run that ends before its last shot: its scanner or its fits have what they need."""
+    """A line about a run that ends before its last shot because its scanner or its fits have enough data."""
     if "scanner" in values:
         return f"{values['scanner']} has converged"
     return f"{values['why']}; {plural(values['n_left'], 'shot')} left out"
 
 
 def window_text(values: Mapping[str, Any]) -> str:
-    """A line about a window that was too short for all batches, or for those that were played."""
+    """A line about a window that was too short for all batches, or for the batches that were played."""
     where = f"shot {values['shot']}, cycle {values['cycle']}"
     if "late_s" in values:
         late, window = (format_quantity(values[name], "time") for name in ("late_s", "window_s"))
@@ -183,7 +183,7 @@ def run_text(run: RunRecord, run_dir: str, n_before: int = 0) -> str:
 
 
 def shot_text(row: IndexRow, run: RunRecord | None) -> str:
-    """A line about a shot that is over."""
+    """A line about a finished shot."""
     name = f"shot {row.shot}"
     if run is not None and (at := point_of_shot(run.scan, row.shot, row.parameters)):
         name += f"  {at}"
@@ -204,13 +204,13 @@ def shot_text(row: IndexRow, run: RunRecord | None) -> str:
 
 
 def measured_texts(row: IndexRow) -> list[str]:
-    """What the run measures in a shot, as far as its images tell; the filling has its own words."""
+    """What the run measures in a shot, if its images tell it. The filling is described elsewhere."""
     own = {name: events for name, events in row.measured.items() if name not in ("filling", "defect_free")}
     return [f"{clean(name)} {percent(n / n_trials)}" for name, (n, n_trials) in own.items() if n_trials]
 
 
 def point_of_shot(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, Any]) -> str:
-    """The scanned values of a shot with their names and units; "" without a scan.
+    """The scanned values of a shot with their names and units. "" without a scan.
 
     Example:
         >>> scan = {"addresses": ["shot.0.load.duration"], "written": [["5 ms"]], "point_of_shot": [0]}
@@ -222,7 +222,7 @@ def point_of_shot(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, A
 
 
 def scanned_names(scan: Mapping[str, Any]) -> list[str]:
-    """The ends of the scanned addresses: "window", "offset.0"; the addresses if two have the same end."""
+    """The ends of the scanned addresses, such as "window". The whole addresses if two ends are the same."""
     addresses = [clean(str(address)) for address in scan.get("addresses", ())]
     names = [*map(_end, addresses)]
     return names if len({*names}) == len(names) else addresses
@@ -234,9 +234,9 @@ def _end(address: str) -> str:
 
 
 def scanned_values(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, Any]) -> list[str]:
-    """The scanned values of a shot, in the units of the sequence; "-" where the record does not have them."""
+    """The scanned values of a shot, in the units of the sequence. "-" where the record lacks them."""
     try:
-        if "written" not in scan:  # an adaptive scan in progress: its record has no points yet
+        if "written" not in scan:  # an adaptive scan in progress, whose record has no points yet
             values = [parameters[address] for address in scan["addresses"]]
             return [written(v, unit) for v, unit in zip(values, scan["written_units"], strict=True)]
         return [clean(str(word)) for word in scan["written"][scan["point_of_shot"][shot]]]
@@ -245,7 +245,7 @@ def scanned_values(scan: Mapping[str, Any], shot: int, parameters: Mapping[str, 
 
 
 def outcome(success: bool, seen_cycle: int, filling_fraction: float, n_atoms: int) -> str:
-    """How a shot ended; ``seen_cycle``: index of the first cycle that met the target, or -1.
+    """How a shot ended. ``seen_cycle`` is the index of the first cycle that met the target, or -1.
 
     Example:
         >>> outcome(True, 1, 1.0, 225)
@@ -264,7 +264,7 @@ def outcome(success: bool, seen_cycle: int, filling_fraction: float, n_atoms: in
 
 
 def point_text(values: Mapping[str, Any]) -> str:
-    """A line about a point of an adaptive scan, and the best one so far."""
+    """A line about a point of an adaptive scan, and the best point so far."""
     best = values["best"]
     at = ", ".join(f"{address} {text}" for address, text in values["written"].items())
     this = f"point {values['point']} ({at}): {values['figure']} {_number(values['value'])}"
@@ -274,7 +274,7 @@ def point_text(values: Mapping[str, Any]) -> str:
 
 
 def best_text(values: Mapping[str, Any]) -> str:
-    """The best point of an adaptive scan so far, without its addresses; "" if there is none."""
+    """The best point of an adaptive scan so far, without its addresses. "" if there is none."""
     best = values["best"]
     if best is None:
         return ""

@@ -1,6 +1,6 @@
 """Options that several commands share, and their completion.
 
-A shell runs the completion at every press of the tab key: nothing heavy is imported here, no plugin is
+A shell runs the completion whenever the tab key is pressed. So nothing heavy is imported here, no plugin is
 loaded, and errors are ignored.
 """
 
@@ -22,13 +22,13 @@ MAX_RUNS: Final = 20
 
 
 def new_kinds(incomplete: str) -> list[str]:
-    """What ``labseq new`` can make.
+    """The kinds that ``labseq new`` can create.
 
     Example:
         >>> new_kinds("st")
         ['static_tweezers', 'step']
     """
-    # the names of the templates and not the table of roles, which imports numpy
+    # the names of the templates, not the table of roles, which imports numpy
     templates = Path(__file__).parents[1] / "scaffold" / "templates"
     roles = sorted(path.stem for path in templates.glob("*.txt") if path.stem != "pyproject")
     return [kind for kind in (*_FILES, *roles) if kind.startswith(incomplete)]
@@ -40,7 +40,7 @@ def file_kinds(incomplete: str) -> list[str]:
 
 
 def profile_names(incomplete: str) -> list[str]:
-    """Names of the profiles in ./hardware_profiles and of those that come with labseq."""
+    """Names of the profiles in ./hardware_profiles and of the profiles that come with labseq."""
     names: set[str] = set()
     for folder in (Path(PROFILES), packaged_profiles_dir()):
         with suppress(OSError):
@@ -49,7 +49,7 @@ def profile_names(incomplete: str) -> list[str]:
 
 
 def measurements(incomplete: str) -> list[str]:
-    """Names of the sequences that come with labseq and fit what they measure."""
+    """Names of the sequences that come with labseq and fit their results."""
     names = {
         path.stem
         for path in packaged_sequences_dir().glob("*.yaml")
@@ -75,10 +75,10 @@ class DryRunKind(StrEnum):
 
 
 def whole_number(text: str) -> int:
-    """The value of an option, which is read as in a file: ``1e3`` is 1000.
+    """The value of an option, read as in a file, where ``1e3`` is 1000.
 
     Raises:
-        PydanticCustomError: It is not a whole number; typer reports it.
+        PydanticCustomError: It is not a whole number. typer reports this.
     """
     from pydantic_core import PydanticCustomError
 
@@ -107,12 +107,12 @@ def run_argument(text: str) -> Any:
 
 
 def dry_run_mode(kind: DryRunKind | None) -> Literal["off", "full", "fast"]:
-    """The mode of a dry run; "off" without ``--dry-run``."""
+    """The mode of a dry run. "off" without ``--dry-run``."""
     return "off" if kind is None else kind.value  # pyright: ignore[reportReturnType]
 
 
 def _load_plugins_of(context: typer.Context, folders: list[Path]) -> None:
-    """Add folders to LABSEQ_PLUGIN_PATH until the command ends; its worker processes inherit them."""
+    """Add folders to LABSEQ_PLUGIN_PATH until the command ends. Its worker processes inherit them."""
     if not folders:
         return
     before = os.environ.get(PLUGIN_PATH)
@@ -133,14 +133,12 @@ Plugins = Annotated[
         metavar="DIR",
         exists=True,
         file_okay=False,
-        help="Also load the plugins in this folder; may be given several times.",
+        help="Also load the plugins in this folder. May be given several times.",
         callback=_load_plugins_of,
         expose_value=False,
     ),
 ]
-Profile = Annotated[
-    str | None, profile_option("Hardware profile, instead of the one that the sequence names.")
-]
+Profile = Annotated[str | None, profile_option("Hardware profile, instead of the sequence's own.")]
 ProfileArgument = Annotated[
     str,
     typer.Argument(
@@ -156,7 +154,7 @@ Overrides = Annotated[
         "--set",
         metavar="ADDRESS=VALUE",
         help="Change one value, for example planner.degree_of_parallelism=2 or profile.mobile_tweezers.speed="
-        '"100 um/ms"; may be given several times. Steps are counted from 0: shot.2.rearrange.window is the '
+        '"100 um/ms". May be given several times. Steps count from 0, so shot.2.rearrange.window is the '
         "window of the third step.",
     ),
 ]
@@ -165,8 +163,8 @@ DryRun = Annotated[
     typer.Option(
         "--dry-run",
         metavar="[=fast]",
-        help="Use no hardware: every device is replaced by its driver's own simulator if it has one, "
-        "else by its virtual twin; with =fast always by the virtual twin.",
+        help="Use no hardware. Every device is replaced by its driver's own simulator if it has one, "
+        "or else by its virtual twin. With =fast, the virtual twin is always used.",
         show_choices=False,
     ),
 ]
@@ -178,30 +176,30 @@ JsonFile = Annotated[
     str | None,
     typer.Option(
         metavar="FILE|-",
-        help="Write the result as JSON; with '-' to stdout, and everything else to stderr.",
+        help="Write the result as JSON. With '-', to stdout, and everything else to stderr.",
     ),
 ]
 SequenceFile = Annotated[
     Path,
     typer.Argument(
         metavar="SEQUENCE",
-        help="The sequence file, or the name of one in ./sequences or of one that comes with labseq.",
+        help="The sequence file, or the name of a sequence in ./sequences or that comes with labseq.",
         show_default=False,
     ),
 ]
 Shots = Annotated[int | None, whole_number_option("Number of shots, instead of the sequence's own.")]
 Seed = Annotated[
-    int | None, whole_number_option("Seed of all random numbers; the same seed gives the same run.")
+    int | None, whole_number_option("Seed of all random numbers. The same seed gives the same run.")
 ]
 Output = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder for the data, instead of LABSEQ_DATA or ./data.")
 ]
 Note = Annotated[
-    str, typer.Option(metavar="TEXT", help="A note about the run, as labseq runs and the web page show it.")
+    str, typer.Option(metavar="TEXT", help="A note about the run, which labseq runs and the web page show.")
 ]
 Tags = Annotated[
     list[str] | None,
-    typer.Option("--tag", metavar="TAG", help="A word to find the run by; may be given several times."),
+    typer.Option("--tag", metavar="TAG", help="A word by which to find the run. May be given several times."),
 ]
 Realtime = Annotated[bool, typer.Option("--realtime", help="Let a simulated run take as long as a real one.")]
 Workers = Annotated[
@@ -209,14 +207,14 @@ Workers = Annotated[
     typer.Option(
         metavar="N",
         min=1,
-        help="Number of simulated runs at a time, each in a process of its own.",
+        help="Number of simultaneous simulated runs, each in its own process.",
     ),
 ]
 Scheduler = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Scheduler of a dask cluster whose workers do the work instead, tls://HOST:PORT "
+        help="Scheduler of a dask cluster that does the work instead, tls://HOST:PORT "
         "(extra labseq[campaign]).",
     ),
 ]
@@ -231,7 +229,7 @@ Keys = Annotated[
 ]
 RunFolder = Annotated[
     Path | None,
-    run_argument("The run's folder, or its name or number as in labseq runs; default: the newest run."),
+    run_argument("The run's folder, or its name or number as in labseq runs. Default: the newest run."),
 ]
 ScanQuantities = Annotated[
     list[str] | None,
@@ -240,7 +238,7 @@ ScanQuantities = Annotated[
         metavar="[QUANTITY]",
         help="A quantity at each point of the scan: survival:before,after between two images, filling, "
         "defect_free or loading (also of one image: filling:before), any column of labseq export, or "
-        "analysis.NAME.KEY; of some sites with @target, @reservoir or @ROWS,COLUMNS; default: what the run "
+        "analysis.NAME.KEY. For some sites, add @target, @reservoir or @ROWS,COLUMNS. Default: what the run "
         "measures. May be given several times.",
     ),
 ]
@@ -249,7 +247,7 @@ Where = Annotated[
     typer.Option(
         metavar="CONDITION",
         help="Only shots in which a quantity, a scanned value or any column of labseq export meets a "
-        "condition: 'filling:before == 1', 'shot.hold.duration > 5 ms'; may be given several times.",
+        "condition: 'filling:before == 1', 'shot.hold.duration > 5 ms'. May be given several times.",
     ),
 ]
 FitName = Annotated[
@@ -257,16 +255,16 @@ FitName = Annotated[
     typer.Option(
         "--fit",
         metavar="MODEL",
-        help="Fit the quantity, by default the first that the run measures, against the scanned value: "
+        help="Fit the quantity (default: the first that the run measures) against the scanned value: "
         "exponential, double_exponential, damped_cosine, gaussian, lorentzian, linear, polynomial, "
-        "saturation, step, plateau, lowering, release_recapture or one of a plugin.",
+        "saturation, step, plateau, lowering, release_recapture or a plugin's model.",
     ),
 ]
 Along = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="In a scan of several values, the one that the fit is along, at each of the others; default: "
+        help="In a scan of several values, the one along which to fit, at each of the others. Default: "
         "the first.",
     ),
 ]
@@ -275,19 +273,19 @@ FitSettings = Annotated[
     typer.Option(
         "--fit-set",
         metavar="NAME=VALUE",
-        help="Fix a parameter of the fit (waist='0.98 um'), or free one (offset=free); may be repeated.",
+        help="Fix a parameter of the fit (waist='0.98 um'), or free one (offset=free). May be repeated.",
     ),
 ]
 DataFolder = Annotated[
     Path | None,
-    typer.Argument(metavar="DATA", help="A data folder; default: LABSEQ_DATA or ./data.", show_default=False),
+    typer.Argument(metavar="DATA", help="A data folder. Default: LABSEQ_DATA or ./data.", show_default=False),
 ]
 Search = Annotated[
     str,
     typer.Option(
         metavar="TEXT",
         help="Only runs whose name, date, note, tags, state, profile, scanned or changed settings or results "
-        "have all these words.",
+        "contain all these words.",
     ),
 ]
 Since = Annotated[str, typer.Option(metavar="DATE", help="Only runs of this day, 2026-11-20, or later.")]
@@ -308,6 +306,6 @@ WhereRuns = Annotated[
         "--where",
         metavar="CONDITION",
         help="Only runs with a result, a changed setting or a number of shots that meets a condition: "
-        "'decay > 2 s', 'shots >= 100'; may be given several times.",
+        "'decay > 2 s', 'shots >= 100'. May be given several times.",
     ),
 ]

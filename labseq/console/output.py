@@ -1,4 +1,4 @@
-"""Writing to stdout, stderr and files: lines, JSON, and streams that are closed or cannot encode."""
+"""Writes lines and JSON to stdout, stderr and files, also if a stream is closed or cannot encode them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from labseq.errors import ConfigError, Problem, RecordingError
 from labseq.messages import visible
 
 STDOUT: Final = "-"
-"""The name that stands for stdout where a file is expected."""
+"""The name that means stdout where a file is expected."""
 
 
 def replace_unencodable() -> None:
     """Let stdout and stderr replace characters that they cannot encode instead of failing.
 
     A stream that was closed before Python started is opened on the null device. Otherwise the
-    next file that is opened, a shot for example, would get its descriptor and its output.
+    next file to be opened, such as a shot, would get its descriptor and its output.
     """
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
@@ -34,13 +34,13 @@ def replace_unencodable() -> None:
 
 
 def say(*lines: str, stream: TextIO | None = None) -> None:
-    """Print lines and flush; to stdout by default.
+    """Print lines and flush. Default: stdout.
 
-    If the reader has closed the pipe, as ``| head`` does, the lines are dropped: a command neither ends
+    If the reader has closed the pipe, as ``| head`` does, the lines are dropped. The command neither ends
     nor changes its exit code because of it.
 
     Raises:
-        RecordingError: They cannot be written, for example because the disk is full.
+        RecordingError: The lines cannot be written, for example because the disk is full.
     """
     out = sys.stdout if stream is None else stream
     with writing_to(out):
@@ -64,7 +64,7 @@ def writing_to(stream: TextIO) -> Generator[None]:
 
 
 def discard_unwritten() -> None:
-    """Drop what stdout and stderr could not take, so that Python does not complain when it ends."""
+    """Drop what stdout and stderr could not write, so that Python does not complain when it ends."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -80,12 +80,12 @@ def _to_null_device(stream: TextIO) -> None:
 
 
 def report_compiling(about_s: float) -> None:
-    """Say on stderr why the command takes longer this time."""
+    """Print on stderr why the command takes longer this time."""
     say(compiling_text(about_s), stream=sys.stderr)
 
 
 def compiling_text(about_s: float) -> str:
-    """What to say before kernels are compiled, which this process is going to do."""
+    """The line to print before this process compiles kernels."""
     from labseq.kernels.kernel import cache_problem  # few commands compile
 
     text = f"compiling kernels, about {max(1.0, about_s):.0f} s"
@@ -105,13 +105,13 @@ def as_line(values: Any) -> str:
 
 
 def stdout_to_stderr() -> Callable[[str], None]:
-    """Redirect stdout to stderr for the rest of the process, C libraries and child processes included.
+    """Redirect stdout to stderr for the rest of the process, including C libraries and child processes.
 
     A program that reads stdout then gets the answer and nothing else.
 
     Returns:
-        Prints a line to the original stdout and closes it. A closed pipe is ignored; anything else
-        that prevents it raises ``RecordingError``.
+        A function that prints a line to the original stdout and closes it. It ignores a closed pipe, and
+        raises ``RecordingError`` if anything else prevents this.
     """
     sys.stdout.flush()
     real, sys.stdout = os.dup(1), sys.stderr
@@ -133,11 +133,11 @@ def json_writer(name: str | None) -> Callable[[Any], None]:
     """Prepare the output of a command's JSON before the command does any work.
 
     Args:
-        name: Name of the file; "-" for stdout, to which nothing else is printed from now on; None
+        name: Name of the file. "-" for stdout, to which nothing else is printed from now on. None
             for no JSON.
 
     Returns:
-        Writes a value on one line.
+        A function that writes a value on one line.
 
     Raises:
         ConfigError: The file cannot be written. The returned function raises it, too.
@@ -153,10 +153,10 @@ def json_writer(name: str | None) -> Callable[[Any], None]:
 
 
 def check_different(*names: str | Path | None) -> None:
-    """Check that no file is named twice: the last output would replace the others. None and "-" are ignored.
+    """Check that no file is named twice, as the last output would replace the others. Ignores None and "-".
 
     Raises:
-        ConfigError: Two of them are the same file.
+        ConfigError: Two names are the same file.
     """
     seen: set[Path] = set()
     for name in names:
@@ -167,7 +167,7 @@ def check_different(*names: str | Path | None) -> None:
         except (OSError, RuntimeError):  # a circle of links is reported when the file is opened
             continue
         if real in seen:
-            what = "this file is named twice, and one would replace the other"
+            what = "this file is given for two outputs, and one would replace the other"
             raise _problem(name, what, hint="choose another name")
         seen.add(real)
 
@@ -176,7 +176,7 @@ def check_writable(path: Path) -> None:
     """Check that a file can be written before hours of work.
 
     Raises:
-        ConfigError: It cannot be written.
+        ConfigError: The file cannot be written.
     """
     try:
         is_new = not path.exists()
@@ -194,7 +194,7 @@ def write_text(path: Path, text: str) -> None:
     """Write a file completely or not at all.
 
     Raises:
-        ConfigError: It cannot be written.
+        ConfigError: The file cannot be written.
     """
     from labseq.files import whole_file
 

@@ -1,4 +1,4 @@
-"""A report is a dataclass: its fields are what ``--json`` prints, its text is what people read.
+"""Reports of commands. A report is a dataclass with fields for ``--json`` and a text for people.
 
 Tables are laid out here rather than by rich, which cuts columns off and breaks paths in a terminal that is
 too narrow for them.
@@ -28,7 +28,7 @@ class Report(Protocol):
     """The result of a command: a dataclass whose fields are the keys of the JSON."""
 
     def as_text(self) -> Iterable[str]:
-        """The same for people."""
+        """The result as lines for people."""
         ...
 
 
@@ -41,11 +41,11 @@ def print_report(report: Report, *, as_json: bool) -> None:
 def reporting(
     *, as_json: bool, failed: Callable[[BaseException], Any] = json_errors
 ) -> Generator[Callable[[Report], None]]:
-    """Hand out the function that prints a command's report.
+    """Provide the function that prints a command's report.
 
     Args:
-        as_json: Whether to print JSON. Everything else then goes to stderr, also what plugins print.
-        failed: What to print as JSON if the command fails.
+        as_json: Whether to print JSON. Everything else, including output of plugins, then goes to stderr.
+        failed: Gives the JSON to print if the command fails.
     """
     if not as_json:
         yield lambda report: say(*report.as_text())
@@ -63,8 +63,8 @@ class Column(Generic[Row]):
     """A column of a table.
 
     Attributes:
-        heading: What stands above it.
-        text: What it shows of a row.
+        heading: Text above the column.
+        text: Row -> text of the cell.
         right: Whether it is aligned on the right, as numbers are.
     """
 
@@ -74,7 +74,7 @@ class Column(Generic[Row]):
 
 
 def table(rows: Iterable[Row], columns: Sequence[Column[Row]], most: int = 0) -> list[str]:
-    """A table with a row for each value; see :func:`aligned`.
+    """A table with a row for each value, see :func:`aligned`.
 
     Example:
         >>> table([0.5, 0.25], [Column("share", lambda x: f"{100 * x:g} %", right=True)])
@@ -90,14 +90,14 @@ def aligned(
 ) -> list[str]:
     """Lay out rows of text in columns two spaces apart.
 
-    Where stdout is a terminal that is too narrow for the table, texts are wrapped between words; columns
-    that still do not fit follow in a second table, behind the first ``keys`` columns. A word that is wider
-    than the terminal, such as a path, stays whole. In a pipe or a file every row stays one line.
+    If stdout is a terminal that is too narrow for the table, texts are wrapped between words. Columns
+    that still do not fit follow in a second table, after the first ``keys`` columns. A word that is wider
+    than the terminal, such as a path, stays whole. In a pipe or a file every row stays on one line.
 
     Args:
-        rows: The cells; all rows have the same number of them.
-        right: Indices of the columns that are aligned on the right; below the header they are not wrapped.
-        most: Maximum number of rows below the header, 0 for all; the middle ones are left out.
+        rows: The cells. All rows have the same number of cells.
+        right: Indices of the columns that are aligned on the right. Below the header they are not wrapped.
+        most: Maximum number of rows below the header, 0 for all. The middle rows are left out.
         keys: Number of columns that tell the rows apart.
 
     Example:
@@ -134,7 +134,7 @@ def aligned(
 
 
 def filled_columns(rows: Sequence[Sequence[str]]) -> list[list[str]]:
-    """Rows of text, the header first, without the columns in which no cell below the header has a value.
+    """Rows of text, the header first, without columns that are empty below the header.
 
     Example:
         >>> filled_columns([["run", "note"], ["7", ""], ["8", "-"]])
@@ -158,7 +158,7 @@ def _total(widths: Sequence[int]) -> int:
 
 
 def _least(column: Sequence[str], is_number: bool) -> int:
-    """The width of a column below which a word or a number would be broken; a drawing is one word."""
+    """The width of a column below which a word or a number would be broken. A drawing counts as one word."""
     whole = [cell for cell in column[1:] if is_number or cell.startswith(" ")]
     words = [word for cell in column for word in _words(cell).split(" ")]
     return max(map(len, [*whole, *words]))

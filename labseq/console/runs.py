@@ -1,4 +1,4 @@
-"""Which run a command is given."""
+"""Finds the run that a command is given."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 
 def chosen_run(path: Path | None, where: Sequence[str] | None = None) -> Run:
-    """Open the run that a command is given; see :func:`folder_of_run`.
+    """Open the run that a command is given, see :func:`folder_of_run`.
 
     Args:
-        path: As that takes it.
+        path: As in that function.
         where: Conditions that its shots must meet.
 
     Raises:
         ConfigError: There is no such run, or no such shot.
-        RecordingError: It is damaged.
+        RecordingError: The run is damaged.
     """
     from labseq.data.reader import open_run  # with numpy, which commands that only name a run do not need
 
@@ -36,10 +36,10 @@ def folder_of_run(path: Path | None) -> Path:
     """The folder of the run that a command is given.
 
     Args:
-        path: Its folder, any file in it, its name or its number; None for the newest run.
+        path: Its folder, any file in it, its name or its number. None for the newest run.
 
     Raises:
-        ConfigError: There is no such run: the command line is wrong, not the data.
+        ConfigError: There is no such run, which is an error in the command line, not in the data.
     """
     try:
         return newest_run(data_root()) if path is None else find_run(path)

@@ -24,7 +24,7 @@ def plural(n: int, noun: str) -> str:
 
 
 def percent(fraction: float | None, digits: int = 1) -> str:
-    """Write a fraction in per cent; "-" if it is None or nan.
+    """Write a fraction in per cent. "-" if it is None or nan.
 
     Example:
         >>> percent(0.9955, 2), percent(None)
@@ -46,7 +46,7 @@ def count_of(n: int, total: int) -> str:
 
 
 def time_text(duration_s: float | None) -> str:
-    """Write a duration with its unit; "-" if it is None or nan.
+    """Write a duration with its unit. "-" if it is None or nan.
 
     Example:
         >>> time_text(0.0012), time_text(None)
@@ -70,7 +70,7 @@ def clock_time(duration_s: float) -> str:
 
 
 def age_text(duration_s: float | None, suffix: str = "") -> str:
-    """Write an age in its largest unit; None for one that the clock does not know.
+    """Write an age in its largest unit. None is for an age that the clock does not know.
 
     Example:
         >>> age_text(90), age_text(3 * 3600, " old"), age_text(None, " old")
@@ -121,7 +121,7 @@ def encodes(encoding: str | None, characters: str) -> bool:
 
 
 def first_of(failures: Sequence[str], rest: str) -> list[str]:
-    """The first failures, and how many there are more.
+    """The first failures, and how many more there are.
 
     Example:
         >>> first_of(["no light", "no frame"], "more"), first_of(list("abcdefg"), "more")[-1]

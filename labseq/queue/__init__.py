@@ -1,1 +1,1 @@
-"""Runs taken one after the other."""
+"""A queue of runs that are taken one after the other."""

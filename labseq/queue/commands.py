@@ -1,4 +1,4 @@
-"""The commands of `labseq queue`; `labseq queue run` is in `labseq.cli.app`."""
+"""The commands of `labseq queue`, except `labseq queue run`, which is in `labseq.cli.app`."""
 
 from typing import Annotated, Literal
 
@@ -57,14 +57,14 @@ def add(
     if_fails: Annotated[
         Literal["stop", "skip", "retry"],
         typer.Option(
-            "--if-fails", help="End the queue if this run fails, skip it, or resume it once and go on then."
+            "--if-fails", help="If this run fails, end the queue, skip it, or resume it once and go on."
         ),
     ] = "stop",
     until: Annotated[
         str | None,
         typer.Option(
             metavar="TIME",
-            help="Take no shot of it after this time, such as 06:00 or '2026-11-30 06:00'.",
+            help="Begin no shot after this time, such as 06:00 or '2026-11-30 06:00'.",
             show_default=False,
         ),
     ] = None,
@@ -72,7 +72,7 @@ def add(
         list[str] | None,
         typer.Option(
             metavar="KIND=AGE",
-            help="Calibrate before it unless the calibration in use is younger, such as thresholds=2h.",
+            help="Calibrate first unless the calibration in use is younger than this, such as thresholds=2h.",
             show_default=False,
         ),
     ] = None,
@@ -82,7 +82,7 @@ def add(
 ) -> None:
     """Check a sequence and add it at the end of the queue.
 
-    The entry keeps the text of the sequence as it is now: later changes of the file have no effect on it.
+    The entry keeps the present text of the sequence. Later changes of the file do not affect it.
     """
     from labseq.assembly.options import Options
     from labseq.queue.running import add_entry, rules_from
@@ -94,7 +94,7 @@ def add(
 
 @queue.command(name="list", short_help="List the entries in order.")
 def list_(as_json: Json = False) -> None:
-    """List the entries that are done since yesterday, that ended early, and that wait, in order."""
+    """List in order the entries that were completed since yesterday, that ended early, and that wait."""
     from labseq.queue.listing import list_entries
 
     list_entries(as_json=as_json)
@@ -106,15 +106,15 @@ def remove(
         list[int], typer.Argument(metavar="ID...", help="Numbers of the entries.", show_default=False)
     ],
 ) -> None:
-    """Remove entries from the queue; the data of their runs stay."""
+    """Remove entries from the queue. The data of their runs stay."""
     from labseq.queue.queue import Queue
 
     Queue(data_root()).remove(ids)
 
 
-@queue.command(short_help="Let an entry wait again that was stopped, failed or was skipped.")
+@queue.command(short_help="Put a stopped, failed or skipped entry back into the queue.")
 def resume(entry: Id) -> None:
-    """Let an entry wait again that was stopped, failed or was skipped; the queue then resumes its run."""
+    """Put a stopped, failed or skipped entry back into the queue, which then resumes its run."""
     from labseq.queue.queue import Queue
 
     Queue(data_root()).wait_again(entry)
@@ -135,7 +135,7 @@ def move(
 def pause(
     off: Annotated[bool, typer.Option("--off", help="Continue with the next entry.")] = False,
 ) -> None:
-    """Let `labseq queue run` wait before its next entry; a run in progress is taken to its end."""
+    """Let `labseq queue run` wait before its next entry. A run in progress continues to its end."""
     from labseq.queue.running import pause_queue
 
     pause_queue(not off)

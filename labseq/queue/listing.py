@@ -1,4 +1,4 @@
-"""`labseq queue list`: the entries, when each is expected to end, and those that are done."""
+"""`labseq queue list`: the entries, when each is expected to end, and completed ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NIGHT: Final = timedelta(hours=24)
 
 
 def local_time(time_utc: str) -> str:
-    """A time by this computer's clock; with its date unless that is today."""
+    """A time by this computer's clock, with its date unless that is today."""
     local = datetime.fromisoformat(time_utc).astimezone()
     return f"{local:%H:%M}" if local.date() == now().astimezone().date() else f"{local:%Y-%m-%d %H:%M}"
 
@@ -29,7 +29,7 @@ def local_time(time_utc: str) -> str:
 def expected_ends(entries: Iterable[Entry]) -> dict[int, str]:
     """Number of each entry that runs or waits -> when its run is expected to end, ISO 8601, UTC.
 
-    An entry whose duration is unknown has none, nor have those behind it.
+    Neither an entry of unknown duration nor the entries after it have an expected end.
     """
     ends: dict[int, str] = {}
     at = now()
@@ -48,9 +48,9 @@ class EntryRow:
     """An entry of the queue.
 
     Attributes:
-        changed: Whether its sequence was changed or removed since; the queued text will run.
-        begun_utc: When its run began; None before.
-        ends_utc: When its run ended, or is expected to end; None if that is unknown.
+        changed: Whether its sequence has been changed or removed. The queued text will run anyway.
+        begun_utc: When its run began. None before.
+        ends_utc: When its run ended or is expected to end. None if this is unknown.
     """
 
     id: int
@@ -68,7 +68,7 @@ class EntryRow:
 
     @classmethod
     def of(cls, entry: Entry, expected: Mapping[int, str]) -> EntryRow:
-        """An entry as the queue's file has it; ``expected`` as :func:`expected_ends` returns it."""
+        """Make the row of an entry. ``expected`` is the result of :func:`expected_ends`."""
         return cls(
             id=entry.id,
             state=entry.state,
@@ -99,7 +99,7 @@ class EntryRow:
 
     @property
     def changes(self) -> dict[str, str]:
-        """The options that differ from their defaults; of the profile's path, the name is enough here."""
+        """The options that differ from their defaults. A profile is given by name, not by path."""
         changes = self.options.changes()
         return changes | ({"profile": Path(changes["profile"]).stem} if "profile" in changes else {})
 
@@ -115,11 +115,11 @@ class EntryRow:
         notes: list[str] = []
         if self.changed:
             name = clean(_short(self.sequence))
-            notes.append(f"{name} was changed or removed since; the queued text will run")
+            notes.append(f"{name} has been changed or removed; the queued text will run")
         if self.error:
             notes.append(visible(self.error.splitlines()[0][:MAX_ERROR]))
         if self.state in {"stopped", "failed", "skipped"}:
-            again = f"'labseq queue resume {self.id}' lets it wait again"
+            again = f"'labseq queue resume {self.id}' puts it back into the queue"
             now = f"'labseq resume {visible(str(self.run_dir))}' resumes its run now, "
             notes.append(again if self.run_dir is None else now + again)
         return [f"{self.id}: {note}" for note in notes]
@@ -145,10 +145,10 @@ ENTRIES: Final[Sequence[Column[EntryRow]]] = (
 
 @dataclass(frozen=True, slots=True)
 class QueueList:
-    """The entries of the queue: those that are done, then the others in order.
+    """The entries of the queue: completed ones, then the others in order.
 
     Attributes:
-        run_by: The process that runs them, or None.
+        run_by: The process that runs the queue, or None.
         paused: Whether no further entry is started.
     """
 
@@ -158,7 +158,7 @@ class QueueList:
 
     @classmethod
     def of(cls, queue: Queue) -> QueueList:
-        """The queue as its files have it.
+        """Read the queue from its files.
 
         Raises:
             RecordingError: An entry is damaged.
@@ -183,7 +183,7 @@ def list_entries(*, as_json: bool) -> None:
 
 
 def outcome_lines(queue: Queue, within: timedelta) -> list[str]:
-    """What became of the entries while the queue was run, for this time, and what still waits."""
+    """What became of the entries in this time while the queue was run, and what still waits."""
     entries = queue.entries()
     lines = [f"queue: {plural(len(queue.done(within)), 'run')} complete"]
     for state in ("failed", "stopped", "interrupted", "skipped", "waiting"):

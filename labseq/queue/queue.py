@@ -1,4 +1,4 @@
-"""The queue: runs that wait, each in a file of its own."""
+"""The queue of runs that wait, each in its own file."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PAUSE_FILE: Final = "PAUSE"
 FORMAT: Final = 1
 """Version of an entry's file."""
 DONE_FOLDER: Final = "done"
-"""Holds the entries whose runs are complete, for the list of the next morning."""
+"""Holds the entries whose runs are complete, so that the list can show them the next morning."""
 EntryStatus = Literal["waiting", "running", "stopped", "failed", "skipped", "complete"]
 IfFails = Literal["stop", "skip", "retry"]
 
@@ -41,14 +41,14 @@ _NUMBER: Final = re.compile(r"(\d{4,})\.(?:json|id)")
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What an entry asks of the process that runs the queue.
+    """What an entry requires of the process that runs the queue.
 
     Attributes:
-        if_fails: "stop": the queue ends if its run fails; "skip": the queue continues; "retry": its run is
-            resumed or begun once more, then the queue continues.
-        until_utc: It begins no shot after this time, ISO 8601, UTC; "" for no such time.
-        needs: Kind of calibration -> the greatest age in seconds that it may have when the run begins; an
-            older one is taken again before.
+        if_fails: What happens if its run fails. "stop" ends the queue and "skip" continues it. "retry"
+            resumes or begins the run once more, then continues the queue.
+        until_utc: No shot begins after this time, ISO 8601, UTC. "" for no limit.
+        needs: Kind of calibration -> its maximum age in seconds when the run begins. An older calibration
+            is taken again first.
     """
 
     if_fails: IfFails = "stop"
@@ -57,7 +57,7 @@ class Rules:
 
     @property
     def is_too_late(self) -> bool:
-        """Whether its time is over."""
+        """Whether its time limit has passed."""
         return bool(self.until_utc) and now() >= datetime.fromisoformat(self.until_utc)
 
 
@@ -66,21 +66,21 @@ class Entry:
     """A queued run.
 
     Attributes:
-        id: Its number, counted from 1; no later entry gets it again.
-        position: Entries are taken in this order.
+        id: Its number, counted from 1. No later entry gets the same number.
+        position: Entries are taken in order of their positions.
         added_utc: When it was added, ISO 8601, UTC.
-        sequence: The sequence's file, absolute.
-        text: The text of that file when it was added; this is what will run.
+        sequence: Absolute path of the sequence's file.
+        text: The text of that file when it was added, which will run.
         options: The options that the user gave.
         status: "waiting", "running", or how its run ended early.
         run_dir: The folder of its run, once there is one.
-        error: Why it did not start or ended early; or "".
-        owner: The process that runs it, or did.
-        rules: What it asks of the process that runs the queue.
-        expected_s: How long its run takes, in seconds; None if that is unknown, as in virtual time.
+        error: Why it did not start or ended early, or "".
+        owner: The process that runs or ran it.
+        rules: What it requires of the process that runs the queue.
+        expected_s: How long its run takes, in seconds. None if unknown, as in virtual time.
         n_failures: Number of times that its run has failed.
-        begun_utc: When its run began or was resumed, ISO 8601, UTC; or "".
-        ended_utc: When its run ended; or "".
+        begun_utc: When its run began or was resumed, ISO 8601, UTC, or "".
+        ended_utc: When its run ended, or "".
     """
 
     id: int
@@ -107,7 +107,7 @@ class Entry:
     @property
     def is_interrupted(self) -> bool:
         """Whether the process that ran it died before its end."""
-        # a process on another computer cannot be looked for: it counts as gone
+        # a process on another computer counts as gone because it cannot be checked
         is_gone = self.owner is None or not (self.owner.is_here and self.owner.is_running)
         return self.status == "running" and is_gone
 
@@ -118,14 +118,14 @@ class Entry:
 
     @property
     def state(self) -> str:
-        """Its state in a word: its status, "interrupted" or "complete"."""
+        """Its state in one word: its status, "interrupted" or "complete"."""
         if self.is_complete:
             return "complete"
         return "interrupted" if self.is_interrupted else self.status
 
     @property
     def has_changed(self) -> bool:
-        """Whether the sequence's file has changed since, or is gone."""
+        """Whether the sequence's file has changed since it was added, or is gone."""
         try:
             return decode(read_bytes(self.sequence), visible(str(self.sequence))) != self.text
         except ConfigError:
@@ -146,7 +146,7 @@ class Queue:
         """All entries, in the order in which they are taken.
 
         Raises:
-            RecordingError: One is damaged, or cannot be read.
+            RecordingError: An entry is damaged, or cannot be read.
         """
         return sorted(_read_all(self.folder), key=lambda entry: (entry.position, entry.id))
 
@@ -171,10 +171,10 @@ class Queue:
         return entry
 
     def done(self, within: timedelta) -> list[Entry]:
-        """The entries whose runs became complete within a time before now, in the order of their ends.
+        """The entries whose runs were completed within a time before now, in the order of their ends.
 
         Raises:
-            RecordingError: One is damaged, or cannot be read.
+            RecordingError: An entry is damaged, or cannot be read.
         """
         first = now() - within
         entries = _read_all(self.folder / DONE_FOLDER)
@@ -182,7 +182,7 @@ class Queue:
         return sorted(ended, key=lambda entry: entry.ended_utc)
 
     def complete(self, entry: Entry) -> None:
-        """Take an entry out of the queue whose run is complete, and keep it for the list.
+        """Take an entry whose run is complete out of the queue, and keep it for the list.
 
         Raises:
             RecordingError: The queue cannot be written to.
@@ -192,7 +192,7 @@ class Queue:
         self.drop(entry.id)
 
     def wait_again(self, number: int) -> None:
-        """Let an entry wait again that was stopped, failed or was skipped; its run will be resumed.
+        """Let a stopped, failed or skipped entry wait again, so that its run is resumed.
 
         Raises:
             ConfigError: There is no such entry, or it waits, runs or is complete.
@@ -219,10 +219,10 @@ class Queue:
         write_file(folder / f"{entry.id:04d}.json", dumps(values, indent=1).encode() + b"\n")
 
     def remove(self, ids: Sequence[int]) -> None:
-        """Take entries out of the queue; their runs stay.
+        """Take entries out of the queue. Their runs stay.
 
         Raises:
-            ConfigError: There is no such entry, or it is running; nothing is removed.
+            ConfigError: There is no such entry, or it is running. Nothing is removed.
         """
         for entry in [self._find(number) for number in ids]:
             if entry.status == "running" and not entry.is_interrupted and not entry.is_complete:
@@ -233,7 +233,7 @@ class Queue:
             self.drop(number)
 
     def drop(self, number: int) -> None:
-        """Take an entry out; legal if it is not there."""
+        """Take an entry out. It may be missing already."""
         with explained(self._file(number)):
             self._file(number).unlink(missing_ok=True)
 
@@ -248,11 +248,11 @@ class Queue:
             return
         positions = [queued.position for queued in self.entries() if queued.id != entry.id]
         lower = max((p for p in positions if p < next_entry.position), default=next_entry.position - 2)
-        # a fraction, as there is always one between two others
+        # a fraction, because there is always another one between two
         self.write(replace(entry, position=(lower + next_entry.position) / 2))
 
     def ask_to_stop(self) -> bool:
-        """Ask the process that runs the queue to take no further entry; False if there is none.
+        """Ask the process that runs the queue to take no further entry. False if there is no process.
 
         Raises:
             RecordingError: The queue cannot be written to.
@@ -308,14 +308,14 @@ class Queue:
         for entry in entries:
             if entry.id == number:
                 return entry
-        expected = ", ".join(str(entry.id) for entry in entries) or "nothing: the queue is empty"
+        expected = ", ".join(str(entry.id) for entry in entries) or "none: the queue is empty"
         raise ConfigError(Problem(f"the queue has no entry {number}", expected=expected))
 
     def _file(self, number: int) -> Path:
         return self.folder / f"{number:04d}.json"
 
     def _new_id(self) -> int:
-        """A number that no entry has or had; the file ``<number>.id`` marks the last one as used."""
+        """A number that no entry has or had. The file ``<number>.id`` marks the last one as used."""
         with explained(self.folder):
             make_folder(self.folder)
             while True:
@@ -324,11 +324,11 @@ class Queue:
                 ]
                 number = max(used, default=0) + 1
                 try:
-                    # several processes may add entries at once: one of them makes the file
+                    # of several processes that add entries at once, only one creates the file
                     (self.folder / f"{number:04d}.id").touch(exist_ok=False)
                 except FileExistsError:
                     continue
-                # one mark is enough: no lower number is given again
+                # one mark is enough because no lower number is given again
                 for older in used:
                     (self.folder / f"{older:04d}.id").unlink(missing_ok=True)
                 return number
@@ -342,10 +342,10 @@ def _read_all(folder: Path) -> list[Entry]:
 
 
 def _read(file: Path) -> Entry | None:
-    """Read an entry; None if it has just been removed.
+    """Read an entry. None if it has just been removed.
 
     Raises:
-        RecordingError: It is damaged, or cannot be read.
+        RecordingError: The entry is damaged, or cannot be read.
     """
     try:
         values = parse_object(read_file(file)) or {}
@@ -372,10 +372,10 @@ def _read(file: Path) -> Entry | None:
 
 
 def _check(entry: Entry, file: Path) -> None:
-    """Check values that have the right types.
+    """Check the values of an entry whose types are right.
 
     Raises:
-        ValueError: It is not as :meth:`Queue.add` writes it.
+        ValueError: A value is not as :meth:`Queue.add` writes it.
     """
     for time in (entry.added_utc, entry.begun_utc, entry.ended_utc, entry.rules.until_utc):
         if time and ((then := datetime.fromisoformat(time)).tzinfo is None or not 2000 <= then.year < 3000):

@@ -37,9 +37,9 @@ from labseq.session.stopping import ask_to_stop
 from labseq.units import parse_quantity, size_text
 
 POLL_S: Final = 0.5
-"""Time between two looks for new entries, or for room on the disk, while the queue waits, in seconds."""
+"""Interval in seconds at which a waiting queue looks for new entries, or for room on the disk."""
 ROOM_BYTES: Final = 100_000_000
-"""Least free space of the disk with which an entry begins: with less, each would fail at its first shots."""
+"""Free space of the disk below which no entry begins, because it would fail at its first shots."""
 
 Opening = Callable[[RunObserver | None], Session]
 """Opens a session whose events go to an observer."""
@@ -54,7 +54,7 @@ def add_checked(
     """Check a sequence as ``labseq check`` does, and add it at the end of the queue.
 
     Raises:
-        LabseqError: Something is wrong with the sequence, the profile or an option; nothing is added.
+        LabseqError: The sequence, the profile or an option is wrong. Nothing is added.
         RecordingError: The queue cannot be written to.
     """
     with Session.open(sequence, **asdict(options)) as session:
@@ -70,7 +70,7 @@ def add_checked(
 
 
 def rules_from(if_fails: IfFails, until: str | None, needs: Sequence[str]) -> Rules:
-    """The rules of an entry, from what was typed.
+    """Parse the rules of an entry as they were typed.
 
     Args:
         if_fails: See :class:`Rules`.
@@ -78,7 +78,7 @@ def rules_from(if_fails: IfFails, until: str | None, needs: Sequence[str]) -> Ru
         needs: "KIND=AGE" for each calibration, such as "thresholds=2h".
 
     Raises:
-        ConfigError: One cannot be read.
+        ConfigError: A rule cannot be read.
     """
     return Rules(if_fails, "" if until is None else _time_utc(until), dict(map(_need, needs)))
 
@@ -95,7 +95,7 @@ def _time_utc(until: str) -> str:
     except ValueError:
         raise ConfigError(Problem(f"--until is '{clean(until)}'", expected=expected)) from None
     if at <= here:
-        raise ConfigError(Problem(f"--until is '{clean(until)}', which is over", expected=expected))
+        raise ConfigError(Problem(f"--until is '{clean(until)}', which is in the past", expected=expected))
     return at.astimezone(UTC).isoformat(timespec="seconds")
 
 
@@ -114,17 +114,17 @@ def _need(text: str) -> tuple[str, float]:
 
 @dataclass(slots=True)
 class QueueRun:
-    """Takes the entries of a queue: first one that was interrupted, then those that wait, in order.
+    """Takes the entries of a queue: first an interrupted one, then those that wait, in order.
 
     Attributes:
         queue: The queue.
         take: Runs the session that its argument opens, and shows it.
         begin: Called with each entry that is taken.
         fail: Called with each error after which the queue continues.
-        calibrate: Takes a calibration: its kind, the profile, and the kind of dry run.
-        keep_going: Whether the queue continues after an entry that failed, whatever its own rule.
+        calibrate: Takes a calibration. Gets its kind, the profile, and the kind of dry run.
+        keep_going: Whether the queue continues after a failed entry, whatever the entry's own rule.
         first_error: The error of the first entry that failed.
-        doubted: Kinds of calibration that an alarm of an earlier run speaks against.
+        doubted: Kinds of calibration that an alarm of an earlier run contradicts.
     """
 
     queue: Queue
@@ -138,10 +138,10 @@ class QueueRun:
     _tried: set[int] = field(default_factory=set[int])
 
     def run(self, *, watch: bool = False) -> None:
-        """Take entries until none waits, or the queue is asked to stop; while it is paused, wait.
+        """Take entries until none waits, or the queue is asked to stop. While it is paused, wait.
 
         Args:
-            watch: Whether to wait for new ones when none waits.
+            watch: Whether to wait for new entries when none waits.
 
         Raises:
             ConfigError: Another process runs the queue.
@@ -155,7 +155,7 @@ class QueueRun:
             raise ConfigError(Problem(f"the queue is already being run: {holder}", str(self.queue.folder)))
         self.queue.clear_stop()
         try:
-            # read each time, as other commands change the queue meanwhile
+            # read each time, because other commands change the queue meanwhile
             while not self.queue.is_asked_to_stop:
                 is_paused = self.queue.is_paused
                 entry = None if is_paused else self._next()
@@ -170,7 +170,7 @@ class QueueRun:
             lock.release()
 
     def _next(self) -> Entry | None:
-        """The entry to take; those whose runs are complete, or whose time is over, are not taken."""
+        """The entry to take next. Entries with a complete run or a passed time limit are not taken."""
         open_entries: list[Entry] = []
         for entry in self.queue.entries():
             if entry.is_complete:
@@ -182,17 +182,17 @@ class QueueRun:
                 open_entries.append(entry)
         interrupted = [entry for entry in open_entries if entry.is_interrupted]
         waiting = [entry for entry in open_entries if entry.status == "waiting"]
-        # an interrupted run holds shots already: its entry comes before all others
+        # an interrupted run holds shots already, so its entry comes before all others
         return next(iter([*interrupted, *waiting]), None)
 
     def _await_room(self, entry: Entry) -> None:
-        """Wait while the disk is full: what fills it may go away, and the rest of the night be taken."""
+        """Wait while the disk is full, because space may be freed and the other entries can then be taken."""
         folder = entry.options.output or self.queue.folder.parent
         is_said = False
         while (n_free := free_bytes(folder)) < ROOM_BYTES and not self.queue.is_asked_to_stop:
             if not is_said:
                 what = f"waits: the disk of {visible(str(folder))} has {size_text(n_free)} free"
-                say(f"queue: {what}, and goes on at {size_text(ROOM_BYTES)}", stream=sys.stderr)
+                say(f"queue: {what}, and continues at {size_text(ROOM_BYTES)}", stream=sys.stderr)
             is_said = True
             time.sleep(POLL_S)
 
@@ -200,7 +200,7 @@ class QueueRun:
         self._await_room(entry)
         if self.queue.is_asked_to_stop:
             return
-        # an entry that fails is not taken again by this process, unless it says so
+        # this process does not take a failed entry again unless the entry's rule asks for it
         self._tried.add(entry.id)
         self.begin(entry)
         owner, begun_utc = Process.current(), now_utc()
@@ -226,7 +226,7 @@ class QueueRun:
     def _failed(self, entry: Entry, recorder: _EntryRecorder, error: LabseqError) -> None:
         """Do what the entry says for a run that has failed."""
         self.first_error = self.first_error or error
-        # a mistake in a file is there the second time, too
+        # a mistake in a file will still be there the second time
         is_tried_again = entry.rules.if_fails == "retry" and entry.n_failures == 0
         if is_tried_again and not isinstance(error, ConfigError):
             self._tried.discard(entry.id)
@@ -248,18 +248,18 @@ class QueueRun:
         profile = str(find_profile(str(named), entry.sequence.parent))
         for kind, max_age_s in entry.rules.needs.items():
             stored = open_store(profile, entry.options.dry_run)[0].entry_in_use(kind)
-            # an age is unknown where this computer's clock is behind: nothing is newer than such an entry
+            # the age is unknown if this computer's clock is behind, so such an entry counts as new
             if stored is None or (age_s(stored.entry) or 0.0) > max_age_s or kind in self.doubted:
                 self.calibrate(kind, profile, entry.options.dry_run)
                 self.doubted.discard(kind)
 
 
 class _EntryRecorder:
-    """Implements ``RunObserver``: keeps the file of the entry that is being taken up to date.
+    """A ``RunObserver`` that keeps the file of the entry in progress up to date.
 
     Attributes:
-        entry: The entry as its file has it.
-        why_stopped: Why its run was asked to end; "" if it was not, or by somebody else.
+        entry: The entry as it is in its file.
+        why_stopped: Why this class asked its run to end. "" if it did not.
     """
 
     def __init__(self, queue: Queue, entry: Entry, doubted: set[str]) -> None:
@@ -270,12 +270,12 @@ class _EntryRecorder:
         self._observer: RunObserver | None = None
 
     def passing_to(self, observer: RunObserver | None) -> _EntryRecorder:
-        """Pass all events on to an observer, too."""
+        """Also pass all events to an observer."""
         self._observer = observer
         return self
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Record the run's folder as soon as there is one; end a run whose time is over."""
+        """Record the run's folder as soon as it exists, and end a run whose time limit has passed."""
         if name == "run_starting":
             self.entry = replace(self.entry, run_dir=Path(values["run_dir"]))
             with suppress(RecordingError):  # the run itself reports a full disk
@@ -293,7 +293,7 @@ class _EntryRecorder:
         self._queue.write(self.entry)
 
     def end(self, status: EntryStatus, error: str) -> None:
-        """Record how it ended; an entry without a run keeps waiting."""
+        """Record how it ended. An entry without a run keeps waiting."""
         status = "waiting" if self.entry.run_dir is None else status
         n_failures = self.entry.n_failures + (status != "stopped")
         self.entry = replace(
@@ -304,7 +304,7 @@ class _EntryRecorder:
 
 
 def _open(entry: Entry, observer: RunObserver) -> Session:
-    """The session of an entry: that of its run if that was interrupted, else a new one."""
+    """The session of an entry, which resumes its run if that was interrupted."""
     options = entry.options
     if entry.run_dir is not None and entry.run_dir.is_dir():
         return Session.resume(entry.run_dir, realtime=options.realtime, observer=observer)
@@ -321,7 +321,7 @@ def add_entry(sequence: Path, options: Options, rules: Rules) -> None:
 
 
 def pause_queue(is_paused: bool) -> None:
-    """Pause the queue, or continue it, and print that."""
+    """Pause or continue the queue, and print which."""
     Queue(data_root()).pause(is_paused)
     paused_text = "the queue is paused: 'labseq queue pause --off' continues it"
     say(paused_text if is_paused else "the queue continues")
@@ -334,14 +334,14 @@ def run_entries(
     keep_going: bool,
     watch: bool,
 ) -> int:
-    """Run the entries of the queue, and say at the end what became of them.
+    """Run the entries of the queue, and print at the end what became of them.
 
     Args:
         run_session: Runs the session that its argument opens, and prints the result.
         calibrate: Takes a calibration, and prints the result.
 
     Returns:
-        The exit code: that of the first entry that failed, or 0.
+        The exit code of the first entry that failed, or 0.
     """
     queue, begun = Queue(data_root()), now()
     notices = Notices.read()

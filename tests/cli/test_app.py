@@ -49,7 +49,7 @@ def test_wrong_usage(arguments: list[str], named: str, call: Any) -> None:
         (ConfigError(Problem("wrong", "a.yaml", 1, 2)), 2, "a.yaml:1:2: wrong\n"),
         (StopRequested(15), 143, "stopped by SIGTERM\n"),
         (StopRequested(1), 129, "stopped because the terminal was closed (SIGHUP)\n"),
-        (ValueError("odd"), 1, "internal error: ValueError: odd; please report it; "),
+        (ValueError("odd"), 1, "internal error: ValueError: odd; please report it with "),
     ],
 )
 @pytest.mark.parametrize("debug", [False, True])

@@ -43,5 +43,7 @@ def test_a_file_that_is_named_twice_is_refused(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "a")
     check_different(None, "-", tmp_path / "a", str(tmp_path / "b"), "-", None)
     for other in (tmp_path / "a", tmp_path / "c" / ".." / "a", tmp_path / "link"):
-        with pytest.raises(ConfigError, match="this file is named twice, and one would replace the other"):
+        with pytest.raises(
+            ConfigError, match="this file is given for two outputs, and one would replace the other"
+        ):
             check_different(str(tmp_path / "a"), other)

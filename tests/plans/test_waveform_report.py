@@ -122,7 +122,10 @@ BAD = [
     ([*WORDS, "--sample-rate", "1"], "cannot be sampled at 1 Hz; expected more than 211.2 MHz"),
     ([*WORDS, "--png", "gone/a.png"], "gone: there is no such folder; expected an existing folder"),
     ([*WORDS, "--npz", "a.npy"], "a.npy: this is not the name of an NPZ file"),
-    (["one.json", "--json", "one.json"], "one.json: this file is named twice, and one would replace the"),
+    (
+        ["one.json", "--json", "one.json"],
+        "one.json: this file is given for two outputs, and one would replace the",
+    ),
     ([*WORDS, "--json", "folder.json", "--npz", "a.npz"], "folder.json: it cannot be written: Is a"),
     (
         ["random:3x3@1", "--seed", "1", "--target", "{pattern: compact, rows: 3, cols: 3}"],

@@ -42,7 +42,7 @@ def test_entries_are_removed_all_or_none(queue: Queue) -> None:
     queue.remove([1, 3])
     assert [entry.id for entry in queue.entries()] == [2]
     queue.remove([2])
-    with pytest.raises(ConfigError, match="nothing: the queue is empty"):
+    with pytest.raises(ConfigError, match="none: the queue is empty"):
         queue.remove([2])
 
 

@@ -190,7 +190,7 @@ def test_rules_are_listed_with_the_expected_ends(capsys: pytest.CaptureFixture[s
     ("options", "what"),
     [
         (("--until", "6 am"), "--until is '6 am'; expected a time such as 06:00"),
-        (("--until", "2001-01-01 06:00"), "which is over"),
+        (("--until", "2001-01-01 06:00"), "which is in the past"),
         (("--needs", "threshold=2h"), "did you mean 'thresholds'?"),
         (("--needs", "thresholds=2"), "--needs thresholds is '2'; expected an age with its unit"),
     ],

@@ -98,7 +98,7 @@ def test_a_folder_of_runs_names_its_latest(tmp_path: Path) -> None:
 def test_a_run_that_died_at_birth_is_explained(tmp_path: Path) -> None:
     run = make_run_folder(tmp_path, "a", NOON)
     (run / "STATE").write_text("{}")
-    with pytest.raises(RecordingError, match="died while its folder was made"):
+    with pytest.raises(RecordingError, match="died while its folder was created"):
         find_run(run / "STATE")
 
 
