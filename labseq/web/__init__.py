@@ -1,1 +1,1 @@
-"""The run in a browser: a web server that reads the data folder, the queue and the calibrations."""
+"""Shows runs in a browser: a web server that reads the data folder, the queue and the calibrations."""

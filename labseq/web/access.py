@@ -1,4 +1,4 @@
-"""Who may use the server, and how fast: token, Host and Origin, rate limits, and the headers of answers."""
+"""Access to the server: token, Host and Origin, rate limits, and the security headers of answers."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ SEND_S: Final = 20.0
 
 @dataclass(slots=True)
 class Rate:
-    """Limits how often each address may do something: a burst at once, then a steady rate.
+    """Limits how often each address may do something, with a burst at once and then a steady rate.
 
     Attributes:
-        per_s: Events a second.
-        burst: Events at once.
-        max_addresses: Addresses that are remembered; those that were quiet for longest are forgotten.
+        per_s: Events per second.
+        burst: Number of events at once.
+        max_addresses: Number of remembered addresses. The address that was quiet longest is forgotten.
     """
 
     per_s: float
@@ -69,7 +69,7 @@ class Rate:
     )
 
     def allows(self, address: str, cost: float = 1.0) -> bool:
-        """Whether an address may do it once more; if so, that is counted as ``cost`` events."""
+        """Whether an address may do it once more. If so, this counts as ``cost`` events."""
         now_s = time.monotonic()
         left, then_s = self._left.pop(address, (self.burst, now_s))
         left = min(self.burst, left + (now_s - then_s) * self.per_s)
@@ -82,11 +82,11 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Who may use the server.
+    """The visitors who may use the server, and what they may do.
 
     Attributes:
-        token: What a visitor must know; "" for everybody who can reach the server.
-        names: Names in the address bar that are this server's, in lower case; addresses are always allowed.
+        token: What a visitor must know. "" for everybody who can reach the server.
+        names: Names of this server in the address bar, in lower case. Numeric addresses are always allowed.
         may_act: Whether visitors may change anything.
     """
 
@@ -96,12 +96,12 @@ class Access:
 
     @property
     def cookie(self) -> str:
-        """The cookie of a visitor who knows the token; it does not contain it."""
+        """The cookie of a visitor who knows the token. It does not contain the token."""
         return hmac.new(self.token.encode(), b"labseq web cookie", hashlib.sha256).hexdigest()
 
 
 def server_names(extra: tuple[str, ...] = ()) -> frozenset[str]:
-    """Names by which this computer is known, and those of a proxy."""
+    """Names by which this computer is known, and names of a proxy."""
     host = socket.gethostname().lower()
     return frozenset(
         {"localhost", host, f"{host.partition('.')[0]}.local", *(name.lower() for name in extra)}
@@ -109,10 +109,10 @@ def server_names(extra: tuple[str, ...] = ()) -> frozenset[str]:
 
 
 def find_token() -> str:
-    """The token: that of LABSEQ_WEB_TOKEN, else that of this user, which is created when it is first needed.
+    """The token from LABSEQ_WEB_TOKEN, or else the user's token, which is created on first use.
 
     Raises:
-        ConfigError: It is too short, or cannot be read or stored.
+        ConfigError: The token is too short, or cannot be read or stored.
     """
     if given := os.environ.get(TOKEN_VARIABLE):
         if len(given) < MIN_TOKEN:
@@ -178,7 +178,7 @@ class Guard:
 
         try:
             refusal = self._refusal(scope, headers, address)
-        except ValueError:  # of urlsplit()
+        except ValueError:  # from urlsplit()
             refusal = 400, "a header of the request is malformed"
         if refusal is not None:
             await _answer(send_safely, *refusal)
@@ -195,7 +195,7 @@ class Guard:
             return 429, "too many requests; wait a few seconds"
         host = headers.get("host", "")
         if not _is_of_server(host, access.names):
-            return 421, "this address is not one of the server's; see `labseq web --name`"
+            return 421, "the server does not have this name; add it with `labseq web --name`"
         if not _is_same_origin(headers, host):
             return 403, "requests from other websites are refused"
         if scope["method"] not in ("GET", "HEAD"):
@@ -256,7 +256,7 @@ def _cookie_of(headers: dict[str, str]) -> str:
 def _is_of_server(host: str, names: frozenset[str]) -> bool:
     """Whether a Host header names this server.
 
-    Addresses always do: another site can point a name at this server (DNS rebinding), but not an address.
+    Numeric addresses always do, because another site can point only a name at this server (DNS rebinding).
     """
     try:
         name = urlsplit(f"//{host}").hostname or ""

@@ -1,4 +1,4 @@
-"""Endpoints that change something: only on a server started with `--control`."""
+"""API endpoints that change something, which exist only on a server started with `--control`."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from labseq.web.runs import Catalogue, NoSuchRun, text_of
 
 MAX_BODY: Final = 64 << 10
 CHECK_S: Final = 60.0
-"""Longest time to check a sequence, in seconds; the first time kernels are compiled."""
+"""Time limit to check a sequence, in seconds. The first check compiles kernels."""
 _NOT_IN_FORM: Final = frozenset({"labseq", "name", "profile", "plugin_folders", "use", "pattern"})
-"""Keys that say what the sequence is, rather than how it runs."""
+"""Keys that identify the sequence rather than say how it runs."""
 _LIMITS: Final = {"minimum": "min", "maximum": "max"}
 
 Schema = Mapping[str, Any]
@@ -40,7 +40,7 @@ Schema = Mapping[str, Any]
 class Actions:
     """The endpoints that change something.
 
-    Sequences are checked in a process of their own, so that the server stays small whatever plugins they use.
+    Sequences are checked in a separate process, so that the server stays small whatever plugins they use.
 
     Args:
         catalogue: The runs.
@@ -63,7 +63,7 @@ class Actions:
                 f"{run}/notes",
                 self.notes,
                 method="POST",
-                body={"comment": "the comment; replaces the previous one", "tags": "list of tags"},
+                body={"comment": "the comment, which replaces the previous one", "tags": "list of tags"},
             ),
             Endpoint(
                 "/queue/add",
@@ -71,7 +71,7 @@ class Actions:
                 method="POST",
                 body={
                     "sequence": "name of a known sequence",
-                    "profile": "name of a profile; the sequence's own by default",
+                    "profile": "name of a profile (default: the sequence's own)",
                     "changes": "address -> value",
                 },
             ),
@@ -84,11 +84,11 @@ class Actions:
         ]
 
     def sequences(self, _: Request) -> Any:
-        """The sequences that can be queued: those in ./sequences, and those that come with labseq."""
+        """The sequences that can be queued, from ./sequences and from labseq."""
         return {"sequences": [*_sequences()]}
 
     def form(self, request: Request) -> Any:
-        """The values of a sequence, with what the schema says of each."""
+        """The values of a sequence, each with its description from the schema."""
         name = request.path_params["sequence"]
         path = _sequences().get(name)
         if path is None:
@@ -158,19 +158,19 @@ class Actions:
         return {"done": "moved"}
 
     async def remove(self, request: Request) -> Any:
-        """Take an entry out of the queue; the data of its run stay."""
+        """Take an entry out of the queue. The data of its run stay."""
         number = _whole_number(await body_of(request), "entry")
         Queue(self._runs.root).remove([number])
         return {"done": f"entry {number} is removed"}
 
     async def resume(self, request: Request) -> Any:
-        """Let an entry wait again that was stopped, failed or was skipped; the queue then resumes its run."""
+        """Put a stopped, failed or skipped entry back into the queue, which then resumes its run."""
         number = _whole_number(await body_of(request), "entry")
         Queue(self._runs.root).wait_again(number)
         return {"done": f"entry {number} waits again"}
 
     async def pause(self, request: Request) -> Any:
-        """Let the queue start no further entry until it is resumed; a run in progress continues."""
+        """Let the queue start no further entry until it is resumed. A run in progress continues."""
         is_paused = (await body_of(request)).get("paused")
         Queue(self._runs.root).pause(is_paused is True)
         return {"done": "paused" if is_paused is True else "continued"}
@@ -182,16 +182,16 @@ class Actions:
         return self._schema
 
     def _labseq(self, arguments: list[str], variables: dict[str, str]) -> str:
-        """Run a labseq command and return what it prints.
+        """Run a labseq command and return its output.
 
         Raises:
-            ConfigError: It reports a mistake.
+            ConfigError: The command reports a mistake.
         """
         import os
 
-        with self._checking:  # one at a time: each takes a core
+        with self._checking:  # one at a time, because each takes a core
             try:
-                done = subprocess.run(  # noqa: S603 - no shell; every value is part of one argument
+                done = subprocess.run(  # noqa: S603 - no shell, and every value is part of one argument
                     [sys.executable, "-m", "labseq", *arguments],
                     env={**os.environ, **variables},
                     stdin=subprocess.DEVNULL,
@@ -230,7 +230,7 @@ async def body_of(request: Request) -> dict[str, Any]:
     """The JSON object in the body of a request.
 
     Raises:
-        ConfigError: It is too long, or not a JSON object.
+        ConfigError: The body is too long, or not a JSON object.
     """
     content = b""
     async for part in request.stream():
@@ -247,15 +247,15 @@ async def body_of(request: Request) -> dict[str, Any]:
 
 
 def form_fields(data: Mapping[str, Any], schema: Schema) -> list[dict[str, Any]]:
-    """The values of a sequence that `--set` can change, JSON-ready.
+    """The values of a sequence that `--set` can change, as JSON-ready values.
 
     Args:
         data: The content of the sequence's file, as plain values.
         schema: The JSON schema of sequences.
 
     Returns:
-        For each value its ``address``, ``value`` ("" if the file does not give one), ``default``,
-        ``about``, ``choices``, ``min`` and ``max``.
+        For each value its ``address``, ``value``, ``default``, ``about``, ``choices``, ``min`` and
+        ``max``. ``value`` is "" if the file does not give one.
     """
     definitions: Schema = schema.get("definitions") or {}
     return list(_mapping_fields(data, schema, definitions, ""))[:300]
@@ -291,7 +291,7 @@ def _step_fields(steps: list[Any], schema: Schema, definitions: Schema) -> Itera
 
 
 def _properties(schema: Schema, definitions: Schema, data: Mapping[str, Any]) -> dict[str, Any]:
-    """The properties of a mapping, with those of the plugin that it chooses."""
+    """The properties of a mapping, including those of the plugin that it chooses."""
     properties = dict(schema.get("properties") or {})
     for rule in schema.get("allOf") or ():
         if "$ref" in rule:
@@ -303,7 +303,7 @@ def _properties(schema: Schema, definitions: Schema, data: Mapping[str, Any]) ->
 
 
 def _resolved(schema: Schema, definitions: Schema) -> Schema:
-    """A schema with its reference filled in; of alternatives, the first that is not null."""
+    """A schema with its reference filled in. Of several alternatives, the first that is not null."""
     if "$ref" in schema:
         return {**(definitions.get(str(schema["$ref"]).rpartition("/")[2]) or {}), **schema}
     alternatives = [option for option in schema.get("anyOf") or () if option.get("type") != "null"]

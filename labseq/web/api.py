@@ -1,4 +1,4 @@
-"""The API under /api/v1: what a browser or another program can ask for."""
+"""The API under /api/v1, which answers requests of browsers and other programs."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ _TEXTS: Final = {"sequence": SEQUENCE_FILE, "profile": PROFILE_FILE}
 
 
 class Api:
-    """The endpoints.
+    """The endpoints that read data, together with the endpoints of actions.
 
     Args:
         catalogue: The runs.
         limits: When alarms are raised.
-        actions: Endpoints of what visitors may do; none if the server only shows.
+        actions: Endpoints for changes. Empty if the server is read-only.
     """
 
     def __init__(self, catalogue: Catalogue, limits: Limits, actions: Sequence[Endpoint] = ()) -> None:
@@ -83,7 +83,7 @@ class Api:
         return [*reading, *self._actions]
 
     def server(self, _: Request) -> Any:
-        """What this server is: version, data folder, whether visitors may act."""
+        """About this server: version, data folder, and whether visitors may make changes."""
         return {
             "labseq": labseq.__version__,
             "data": text_of(self._runs.root),
@@ -93,17 +93,17 @@ class Api:
         }
 
     def now(self, _: Request) -> Any:
-        """The state of the run in progress, else of the newest run: all that the page "Now" shows."""
+        """The state of the run in progress, or else of the newest run, as the page "Now" shows it."""
         return self._live.state()
 
     async def events(self, request: Request) -> Response:
-        """The same state as server-sent events, each time it changes: of the newest run, or of one run.
+        """The state of the newest run or of one run, as a server-sent event each time it changes.
 
-        After `Last-Event-ID` the current state is sent, or nothing if it is still the same.
+        After `Last-Event-ID` the current state is sent, unless it is still the same.
         """
         address = request.client.host if request.client else ""
         if not self._live.has_room(address):
-            return JSONResponse({"error": f"{self._live.n_viewers} pages are open already"}, 503)
+            return JSONResponse({"error": f"{self._live.n_viewers} pages are already open"}, 503)
         query = request.query_params
         channel = self._live.channel(query.get("day", ""), query.get("name", ""), _quantity(request))
         states = self._live.states(channel, request.headers.get("last-event-id", ""), address)
@@ -113,15 +113,15 @@ class Api:
     def runs(self, request: Request) -> Any:
         """The runs, the newest first.
 
-        A search answers within a few seconds. Runs that it has not read by then are counted as `n_unread`:
-        ask again.
+        A search answers within a few seconds. Runs that it has not read by then are counted as `n_unread`.
+        Ask again to include them.
         """
         query = request.query_params
         first, most = _number(query, "first", 0), min(MAX_LISTED, _number(query, "n", 50))
         return self._runs.search(query.get("q", "")[:200], query.get("status", "")[:20], first, most)
 
     def run(self, request: Request) -> Any:
-        """A run: its head, figures, what it measures with trends, losses, what was changed, its files."""
+        """A run: head, figures, measured quantities with trends, losses, changes and files."""
         run = self._opened(request)
         record, (status, error) = run.record, read_state(run.folder)
         run.history.update()
@@ -153,7 +153,7 @@ class Api:
         return self._live.state(request.path_params["day"], request.path_params["name"])
 
     def statistics(self, request: Request) -> Any:
-        """Statistics of each cycle, defects and stages, from at most 500 shots evenly chosen."""
+        """Statistics of each cycle, defects and stages, from at most 500 evenly chosen shots."""
         run = self._opened(request)
         run.history.update()
         counted = run.history.columns().counted.tolist()
@@ -172,17 +172,17 @@ class Api:
         }
 
     def scan(self, request: Request) -> Any:
-        """The points of a run's scan, with what it measures or `quantity`, and its fit; null without a scan.
+        """The points of a run's scan, with measured values or `quantity`, and fits. null without a scan.
 
-        Shots whose files have not been read for the quantity yet are counted as `n_unread`: ask again.
+        Shots whose files have not been read yet are counted as `n_unread`. Ask again to include them.
         """
         run = self._opened(request)
         return self._live.state_of(run).scan(_quantity(request), most_s=8.0)
 
     def map(self, request: Request) -> Any:
-        """A quantity at each site, from at most 500 shots evenly chosen: what is measured, or `quantity`.
+        """A measured quantity or `quantity` at each site, from at most 500 evenly chosen shots.
 
-        `values` and `n_trials` have a row for each row of sites; a value from fewer than 5 trials is null.
+        `values` and `n_trials` have a row for each row of sites. A value from fewer than 5 trials is null.
         """
         run = self._opened(request)
         run.history.update()
@@ -202,7 +202,7 @@ class Api:
         }
 
     def shots(self, request: Request) -> Any:
-        """The shots of a run, the newest first, with attempts that do not count."""
+        """The shots of a run, the newest first, including attempts that do not count."""
         run = self._opened(request)
         run.history.update()
         first = _number(request.query_params, "first", 0)
@@ -232,7 +232,7 @@ class Api:
         }
 
     def shot(self, request: Request) -> Any:
-        """A shot: images with occupancies, cycle by cycle moves, stages and readings."""
+        """A shot: images with occupancies, moves of each cycle, stages and readings."""
         run = self._opened(request)
         line = self._line(run, request)
         record = run.record
@@ -241,11 +241,11 @@ class Api:
         return {"run": head_of(run, record, status, error), "shot": values}
 
     def motion(self, request: Request) -> Any:
-        """Tones and atoms of a cycle in time, with the atoms that were lost; places in sites, times in ms.
+        """Tones and atoms of a cycle over time, and the atoms that were lost. Places in sites, times in ms.
 
-        A tone is a list of [time, place, depth] and an atom one of [time, row, column], straight in between;
-        a tweezer is at each crossing of tones that are on. `fates` are null for an atom that is kept, else
-        how and when it goes: ejected, lost, or missing on the next image. `cycle` counts all of the shot.
+        A tone is a list of [time, place, depth] and an atom a list of [time, row, column], linear in between.
+        There is a tweezer at each crossing of tones that are on. `fates` is null for an atom that is kept, or
+        tells how and when it goes: ejected, lost, or missing on the next image. `cycle` counts all cycles.
         """
         run = self._opened(request)
         shot, cycle = run.shot(self._line(run, request)), _number(request.path_params, "cycle", 0)
@@ -257,7 +257,7 @@ class Api:
         """A frame of a shot in 8 bit, its darkest pixels black and its brightest white."""
         key, now_s = str(request.url), time.monotonic()
         cached = self._frames.get(key)
-        if cached is None or now_s - cached[0] > 2.0:  # many pages ask for the same one at once
+        if cached is None or now_s - cached[0] > 2.0:  # many pages ask for the same frame at once
             cached = self._frames[key] = (
                 now_s,
                 asyncio.ensure_future(in_thread(partial(self._frame, request))),
@@ -275,7 +275,7 @@ class Api:
         return frame_png(shot, _number(request.path_params, "image", 0), width)
 
     def file(self, request: Request) -> Response:
-        """The sequence or the profile as it was when the run began: `kind` is one of them."""
+        """The sequence or the profile as it was when the run began. `kind` is "sequence" or "profile"."""
         run = self._opened(request)
         name = _TEXTS.get(request.path_params["kind"])
         if name is None:
@@ -284,11 +284,11 @@ class Api:
         return PlainTextResponse(text_of(text, most=1 << 20))
 
     def queue(self, _: Request) -> Any:
-        """The queue: its entries in the order in which they are taken, and the process that takes them."""
+        """The queue: its entries in order, and the process that takes them."""
         return queue_values(self._runs.root)
 
     def calibrations(self, _: Request) -> Any:
-        """All calibrations by folder and kind with their quality, and those in use."""
+        """All calibrations by folder and kind with their quality, and the ones in use."""
         return calibrations(self._runs)
 
     def calibration_picture(self, request: Request) -> Response:
@@ -313,7 +313,7 @@ class Api:
         return line
 
     def openapi(self) -> dict[str, Any]:
-        """The API as an OpenAPI document."""
+        """Describe the API as an OpenAPI document."""
         paths: dict[str, dict[str, Any]] = {}
         for endpoint in self.endpoints():
             paths.setdefault(BASE + endpoint.path, {})[endpoint.method.lower()] = describe(endpoint)
@@ -370,10 +370,10 @@ def _label(text: str) -> str:
 
 
 def _number(values: Mapping[str, Any], name: str, default: int) -> int:
-    """A whole number from the address, -1 for all negative ones.
+    """A whole number from the address. Negative numbers give -1.
 
     Raises:
-        NoSuchRun: It is not a whole number.
+        NoSuchRun: The text is not a whole number.
     """
     text = str(values.get(name, default))
     if not (text.removeprefix("-").isdecimal() and len(text) < 12):

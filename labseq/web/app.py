@@ -1,4 +1,4 @@
-"""The application: the pages, the files that they consist of, the API and the metrics."""
+"""The web application: pages and their files, the API and the metrics."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PAGES: Final = (
     *("/", "/now", "/scan", "/runs", "/compare", "/queue", "/calibrations", "/api"),
     *("/runs/{day}/{name}", "/runs/{day}/{name}/shots/{shot}"),
 )
-"""Addresses of pages: one HTML file, whose script shows what the address asks for."""
+"""Addresses of pages. All show the same HTML file, whose script shows what the address asks for."""
 _KINDS: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
 
 
@@ -38,7 +38,7 @@ def make_app(root: Path, access: Access | None = None, limits: Limits | None = N
 
     Args:
         root: The data folder.
-        access: Who may use it; by default everybody who can reach it, without changing anything.
+        access: Who may use it. Default: everybody who can reach it, without changing anything.
         limits: When alarms are raised.
     """
     allowed = access or Access()

@@ -17,23 +17,23 @@ def web(
     data: Annotated[
         Path | None,
         typer.Argument(
-            metavar="DATA", help="A data folder; default: LABSEQ_DATA or ./data.", show_default=False
+            metavar="DATA", help="A data folder. Default: LABSEQ_DATA or ./data.", show_default=False
         ),
     ] = None,
     host: Annotated[
         str,
         typer.Option(
-            metavar="ADDRESS", help="Address to listen on; any but this computer's own needs a token."
+            metavar="ADDRESS", help="Address to listen on. Any but this computer's own needs a token."
         ),
     ] = "127.0.0.1",
     port: Annotated[
-        int, typer.Option(metavar="N", min=0, max=65535, help="Port; 0 for any free one.")
+        int, typer.Option(metavar="N", min=0, max=65535, help="Port. 0 for any free port.")
     ] = 8642,
     name: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="A further name of the server, such as that of a proxy in front of it; may be repeated.",
+            help="A further name of the server, such as the name of a proxy in front of it. May be repeated.",
             show_default=False,
         ),
     ] = None,
@@ -57,8 +57,8 @@ def web(
 ) -> None:
     """Show runs, scans, queue and calibrations in a browser.
 
-    The server only reads the data folder: runs do not depend on it. It prints the address to open,
-    which contains a token if other computers can reach it or visitors may act.
+    The server only reads the data folder, so runs do not depend on it. It prints the address to open,
+    which contains a token if other computers can reach it or visitors may make changes.
     """
     from labseq.web.serve import Serving, serve
 

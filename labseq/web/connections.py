@@ -1,6 +1,6 @@
-"""Limits of connections, which hold before a request reaches the application and its guard.
+"""Limits of connections, which apply before a request reaches the application and its guard.
 
-uvicorn reads headers of any length for any time, and counts idle connections as requests.
+By itself, uvicorn reads headers of any length for any time, and counts idle connections as requests.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from uvicorn.protocols.utils import get_remote_addr
 MAX_HEADERS: Final = 16 << 10
 """Largest request line with all headers, in bytes."""
 MAX_REQUEST: Final = 128 << 10
-"""Largest request, in bytes; the bodies that the API takes are smaller."""
+"""Largest request, in bytes. The bodies that the API takes are smaller."""
 REQUEST_S: Final = 10.0
-"""Longest time from the first byte of a request, or the connection, to its last byte, in seconds."""
+"""Time limit from the first byte of a request, or from the connection, to its last byte, in seconds."""
 MAX_IDLE: Final = 192
-"""Maximum number of connections without a request in progress; of more, the oldest is closed."""
+"""Maximum number of connections without a request in progress. Beyond that, the oldest is closed."""
 MAX_IDLE_OF_ADDRESS: Final = 48
-"""The same for one address; a browser has six."""
+"""Maximum number of such connections from one address. A browser has six."""
 
 
 class LimitedProtocol(HttpToolsProtocol):
     """A connection of a browser, with limits.
 
     Attributes:
-        since_s: When it was made.
-        is_idle: Whether it has no request in progress; one whose headers are coming is none.
+        since_s: When the connection was made.
+        is_idle: True if no request is in progress. A request counts once its headers are complete.
 
     Args:
-        *args: Those of uvicorn.
-        tls: Certificate and key; None without TLS. uvicorn would tell of a connection after the handshake.
-        **named: Those of uvicorn.
+        *args: Arguments of uvicorn.
+        tls: Certificate and key. None without TLS. uvicorn would report a connection after the handshake.
+        **named: Keyword arguments of uvicorn.
     """
 
     def __init__(self, *args: Any, tls: ssl.SSLContext | None = None, **named: Any) -> None:
@@ -47,7 +47,7 @@ class LimitedProtocol(HttpToolsProtocol):
         self._early: list[bytes] = []  # what came with the end of the handshake
         self.since_s: float = time.monotonic()
         self.is_idle = True
-        self._n_bytes = 0  # of the request that is coming
+        self._n_bytes = 0  # of the request that is arriving
         self._has_headers = False
         self._late: TimerHandle | None = None
 
@@ -62,7 +62,7 @@ class LimitedProtocol(HttpToolsProtocol):
         if self._tls is None:
             super().connection_made(transport)
         else:
-            transport.pause_reading()  # the handshake is not for the parser of requests
+            transport.pause_reading()  # the parser of requests must not see the handshake
             self.transport, self.client = transport, get_remote_addr(transport)
             self.connections.add(self)
             self._handshake = self.loop.create_task(self._agree(transport, self._tls))
@@ -71,14 +71,14 @@ class LimitedProtocol(HttpToolsProtocol):
         ((address, most),) = Counter(peer.address for peer in idle).most_common(1)
         if most > MAX_IDLE_OF_ADDRESS or len(idle) > MAX_IDLE:
             oldest = next(peer for peer in idle if peer.address == address)
-            self.connections.discard(oldest)  # now: a burst of connections would close the same one again
+            self.connections.discard(oldest)  # now, or a burst of connections would close the same one again
             oldest.transport.abort()
 
     async def _agree(self, transport: Transport, tls: ssl.SSLContext) -> None:
         """Do the handshake of TLS, then read requests."""
         try:
             encrypted = await self.loop.start_tls(transport, self, tls, server_side=True)
-        except OSError as error:  # of ssl, or the connection has ended
+        except OSError as error:  # from ssl, or the connection has ended
             transport.abort()
             self.connection_lost(error)
             return
@@ -96,7 +96,7 @@ class LimitedProtocol(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Read on, unless the request is too long."""
+        """Read more data, unless the request is too long."""
         if self._handshake is not None:
             self._early.append(data)
             return
@@ -114,7 +114,7 @@ class LimitedProtocol(HttpToolsProtocol):
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
-        """The request has come, in time."""
+        """Stop the timer, because the request arrived in time."""
         self._end_wait()
         self._n_bytes, self._has_headers = 0, False
         super().on_message_complete()

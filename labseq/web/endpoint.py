@@ -1,4 +1,4 @@
-"""Endpoints of the API: their description, the answer to a request, and their OpenAPI entry."""
+"""Endpoints of the API: description, answer to a request, and OpenAPI entry."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from labseq.web.runs import NoSuchRun, text_of
 
 T = TypeVar("T")
 _THREADS: Final = ThreadPoolExecutor(6, "labseq web")
-"""Few, because each thread keeps memory of its own."""
+"""Few threads, because each keeps its own memory."""
 _DESCRIPTIONS: Final = {
     "day": "date of the run's folder, 2026-11-20",
     "name": "name of the run's folder, 0001_compact-225",
     "shot": "index of the shot, from 0",
     "image": "index of the image in the shot, from 0",
     "cycle": "index of the cycle in the shot, from 0",
-    "attempt": "an attempt that does not count; by default the one that counts",
-    "quantity": "what to show at the points of the scan: survival:before,after@target; by default what the "
-    "run measures",
+    "attempt": "number of an attempt that does not count (default: the attempt that counts)",
+    "quantity": "quantity at the points of the scan, such as survival:before,after@target (default: what "
+    "the run measures)",
     "q": "words that date, name, profile, settings, results, comment or tags must contain",
     "status": "running, complete, stopped, failed or damaged",
     "first": "number of rows to leave out",
@@ -44,15 +44,15 @@ _DESCRIPTIONS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """An address of the API; its description is the docstring of its function.
+    """An address of the API. Its description is the docstring of its function.
 
     Attributes:
-        path: Below /api/v1.
-        answer: Makes the answer from the request; called in a thread unless it is a coroutine.
+        path: Path below /api/v1.
+        answer: Makes the answer from the request. Called in a thread unless it is a coroutine.
         query: Names of its query parameters.
         content: Media type of the answer.
         method: "GET" or "POST".
-        body: Names of the values in the body of a POST, and what they are.
+        body: Names of the values in the body of a POST, and their descriptions.
     """
 
     path: str
@@ -64,12 +64,12 @@ class Endpoint:
 
     @property
     def description(self) -> str:
-        """What it answers."""
+        """The first paragraph of its docstring."""
         return inspect.cleandoc(self.answer.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
 
 
 async def answer(endpoint: Endpoint, request: Request) -> Response:
-    """Answer a request; an error becomes an answer that gives the reason."""
+    """Answer a request. An error becomes an answer that gives the reason."""
     try:
         if inspect.iscoroutinefunction(endpoint.answer):
             content = await endpoint.answer(request)
@@ -95,7 +95,7 @@ async def in_thread(work: Callable[[], T], threads: ThreadPoolExecutor = _THREAD
 
 
 def encode(values: object) -> str:
-    """A value as JSON of one line."""
+    """A value as one line of JSON."""
     return json.dumps(values, allow_nan=False, separators=(",", ":"), default=str)
 
 
@@ -112,7 +112,7 @@ def describe(endpoint: Endpoint) -> dict[str, Any]:
         "responses": {
             "200": {"description": "as described", "content": {endpoint.content: {}}},
             "404": {"description": "there is no such thing"},
-            "409": {"description": "it cannot be read or cannot be done; 'error' says why"},
+            "409": {"description": "it cannot be read or cannot be done, and 'error' says why"},
         },
     }
     if endpoint.body is not None:

@@ -1,4 +1,4 @@
-"""Fits what a run measures while its points come, in a thread of its own."""
+"""Fits measured quantities while points arrive, in a separate thread."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SLOW_S: Final = 20.0
 
 
 class LiveFit:
-    """A fit that is made again as the points change. Its methods are called under the lock of the run.
+    """A fit that is repeated as the points change. Its methods are called under the lock of the run.
 
     Args:
         quantity: The quantity.
@@ -37,7 +37,7 @@ class LiveFit:
         run: The run, with or without shots.
 
     Attributes:
-        is_ready: Whether the last result was that of the newest points.
+        is_ready: Whether the last result belongs to the newest points.
     """
 
     def __init__(self, quantity: Quantity, measure: Mapping[str, Any], run: Run) -> None:
@@ -51,15 +51,15 @@ class LiveFit:
         self._result = [_no_fit("the first fit is being computed")]
 
     def result(self, scan: Scanned, means: Sequence[Estimated]) -> list[dict[str, Any]]:
-        """The newest fits that are ready, for JSON; fits of other points than before are begun.
+        """The newest finished fits, for JSON. If the points have changed, a new fit is started.
 
         Args:
             scan: The points so far.
-            means: The quantity at each.
+            means: The quantity at each point.
 
         Returns:
-            A fit along the first axis at each combination ``at`` of the values of the others; where there is
-            none, the reason.
+            A fit along the first axis at each combination ``at`` of values of the other axes, or the
+            reason why there is none.
         """
         if scan.on_axis(0) is None:
             return [_no_fit("a fit needs a scan of one number")]
@@ -67,12 +67,12 @@ class LiveFit:
         is_busy = self._thread is not None and self._thread.is_alive()
         if text != self._points and not is_busy and now_s - self._started_s >= _PERIOD_S:
             self._points, self._started_s = text, now_s
-            # not of a pool: the end of the server does not wait for a model that hangs
+            # not from a pool, because the end of the server must not wait for a model that hangs
             self._thread = threading.Thread(target=self._compute, args=(scan, means, text), daemon=True)
             self._thread.start()
         self.is_ready = self._fitted_points == text
         if is_busy and now_s - self._started_s > _SLOW_S:
-            what = f"it has not ended after {_SLOW_S:.0f} s: fix a parameter, or choose another model"
+            what = f"it has not ended after {_SLOW_S:.0f} s; fix a parameter, or choose another model"
             return [_no_fit(what)]
         return self._result
 
@@ -109,9 +109,9 @@ def _fit(
     Args:
         at: The fit.
         scan: The points of the scan.
-        means: The quantity at each.
+        means: The quantity at each point.
         name: The parameter to report.
-        shown: The unit in which its values at all ``at`` are readable, and its factor to SI.
+        shown: The unit in which its values at all ``at`` are easy to read, and its factor to SI.
     """
     words = [text_of(word, 60) for word in at.written.values()]
     numbers, unit = scan.on_axis(0) or ([], "")

@@ -35,18 +35,18 @@ _NUMBERS: Final[Mapping[str, Callable[[IndexRow], float]]] = {
     "duration_s": lambda row: row.duration_s,
     "t_s": lambda row: _seconds(row.t_start_utc),
 }
-"""Column -> its number in a row of the index."""
+"""Column -> function that takes its number from a row of the index."""
 
 
 class RunHistory:
-    """The lines of a run's index as columns of numbers: 20,000 shots take 3 MB, not 100 MB.
+    """The lines of a run's index as columns of numbers. 20,000 shots take 3 MB instead of 100 MB.
 
     All methods may be called from several threads.
 
     Args:
         run_dir: The run's folder.
-        follower: Reads what is added to the index.
-        series_of: Makes the series of what the page of the run shows.
+        follower: Reads lines that are added to the index.
+        series_of: Makes the series of the quantities that the page of the run shows.
     """
 
     def __init__(self, run_dir: Path, follower: Follower, series_of: Callable[[], list[Series]]) -> None:
@@ -66,7 +66,7 @@ class RunHistory:
         """Read the lines that were added.
 
         Raises:
-            RecordingError: The file, or run.json, cannot be read.
+            RecordingError: The index or run.json cannot be read.
         """
         with self._lock:
             if self._series is None:
@@ -102,7 +102,7 @@ class RunHistory:
             column.append(lost.get(name, math.nan))
 
     def __len__(self) -> int:
-        """Number of lines that can be read: shots, and attempts that do not count."""
+        """Number of readable lines, for shots and for attempts that do not count."""
         return len(self._shot)
 
     @property
@@ -114,7 +114,7 @@ class RunHistory:
         """A row of the index, read from the file.
 
         Raises:
-            RecordingError: It cannot be read.
+            RecordingError: The row cannot be read.
         """
         with self._lock:
             row = _row_of(next(lines_in(self._path, self._start[line]), b""))
@@ -123,17 +123,17 @@ class RunHistory:
         return row
 
     def rows(self, first: int) -> Generator[IndexRow]:
-        """The rows of the index from a line on, read from the file.
+        """The rows of the index from a given line, read from the file.
 
         Raises:
-            RecordingError: It cannot be read.
+            RecordingError: The index cannot be read.
         """
         if first < len(self):
             readable = (row for text in lines_in(self._path, self._start[first]) if (row := _row_of(text)))
             yield from itertools.islice(readable, len(self) - first)
 
     def line_of(self, shot: int, attempt: int | None = None) -> int | None:
-        """The line of a shot that counts, or of one attempt; None if there is none."""
+        """The line of a shot that counts, or of one attempt. None if there is no such line."""
         if attempt is None:
             return self._line_of.get(shot)
         for line in range(len(self._shot) - 1, -1, -1):
@@ -160,9 +160,9 @@ class Columns:
     Args:
         shot: int64 (n_lines,), index of the shot.
         attempt: int64 (n_lines,), index of the attempt.
-        counts: bool (n_lines,), whether it completed the shot.
+        counts: bool (n_lines,), whether the attempt completed the shot.
         numbers: Name -> float64 (n_lines,), nan where it is unknown.
-        lost: Cause -> float64 (n_lines,), atoms that a simulation lost.
+        lost: Cause -> float64 (n_lines,), number of atoms that a simulation lost.
         series: The quantities that the page of the run shows, the most important first.
     """
 
@@ -180,7 +180,7 @@ class Columns:
         self.counted = np.flatnonzero(counts)[np.argsort(shot[counts], kind="stable")]
 
     def of_shots(self, name: str) -> NDArray[np.float64]:
-        """A column of the shots that count, by their index."""
+        """A column of the shots that count, in order of shot index."""
         return self.numbers[name][self.counted]
 
     @property
@@ -205,7 +205,7 @@ class Columns:
         return [self._quantity(series, n_bins) for series in self.series]
 
     def means(self) -> list[dict[str, Any]]:
-        """The same without trends."""
+        """The quantities with their means but without trends."""
         return [self._quantity(series, 0) for series in self.series]
 
     def _quantity(self, series: Series, n_bins: int) -> dict[str, Any]:
@@ -226,7 +226,7 @@ class Columns:
 
         Args:
             n_most: Maximum number of bins.
-            min_shots: Minimum number of shots in a bin; with fewer than twice as many shots, each is a bin.
+            min_shots: Minimum number of shots in a bin. With fewer than twice as many shots, each is a bin.
         """
         n = len(self.counted)
         n_bins = min(n_most, n // min_shots if n >= 2 * min_shots else n)
@@ -254,7 +254,7 @@ def judged_values(filling: Estimate, rate: Rate) -> dict[str, Any]:
 
 
 def _seconds(t_utc: str) -> float:
-    """ISO 8601 as seconds since 1970; nan if it is damaged."""
+    """ISO 8601 as seconds since 1970. nan if it is damaged."""
     try:
         return datetime.fromisoformat(t_utc).timestamp()
     except (ValueError, OverflowError):

@@ -1,4 +1,4 @@
-"""Sends the state of runs to browsers; a slow browser misses states without delaying the others."""
+"""Sends the state of runs to browsers. A slow browser misses states without delaying the others."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from labseq.web.runs import Catalogue, NoSuchRun, OpenRun, text_of
 from labseq.web.state import Limits, RunState, alarm
 
 POLL_S: Final = 0.1
-"""Interval at which the files of a run in progress are read while a browser watches it, in seconds."""
+"""Interval in seconds at which the files of a run in progress are read while a browser watches it."""
 HEARTBEAT_S: Final = 15.0
-"""Something is sent at least this often, in seconds, so that a dead connection is noticed."""
+"""Maximum time between two messages, in seconds, so that a dead connection is noticed."""
 MAX_VIEWERS: Final = 100
 MAX_VIEWERS_OF_ADDRESS: Final = 50
 _THREADS: Final = ThreadPoolExecutor(2, "labseq web live")
-"""Pages that watch many runs must not keep other requests waiting for a thread."""
+"""Separate, so that pages that watch many runs do not keep other requests waiting for a thread."""
 
 
 class Channel:
-    """One run, or the newest one, for all browsers that watch it.
+    """The state of one run, or of the newest, for all browsers that watch it.
 
-    Only the latest state is kept, encoded once for all. A slow browser gets the latest when it is ready for
-    the next one.
+    Only the latest state is kept, encoded once for all. A slow browser gets the latest state when it is
+    ready for the next one.
 
     Args:
-        read: Returns the state of the run; may take time, and is called in a thread.
+        read: Returns the state of the run. It may take time, and is called in a thread.
     """
 
     def __init__(self, read: Callable[[], dict[str, Any]]) -> None:
@@ -45,12 +45,12 @@ class Channel:
         self.version = 0
 
     async def states(self, after: str) -> AsyncGenerator[str, None]:
-        """The states as server-sent events, from now on until the browser leaves.
+        """The states as server-sent events, from now until the browser leaves.
 
-        The last shot, which is half of a state, is an event of its own, sent before the state if it is new.
+        The last shot, which is half of a state, is a separate event, sent before the state if it is new.
 
         Args:
-            after: Id of the last event that the browser has; the current state is left out if it is the same.
+            after: Id of the last event that the browser has. The current state is skipped if it is the same.
         """
         self.n_viewers += 1
         if self._task is None or self._task.done():
@@ -89,7 +89,7 @@ class Channel:
 
 
 class Live:
-    """The runs that are watched.
+    """The states of the runs that browsers watch.
 
     Args:
         catalogue: The runs.
@@ -104,11 +104,11 @@ class Live:
         self._n_of_address: Counter[str] = Counter()
 
     def has_room(self, address: str) -> bool:
-        """Whether one more page of an address may follow a run."""
+        """Whether an address may open one more page that follows a run."""
         return self.n_viewers < MAX_VIEWERS and self._n_of_address[address] < MAX_VIEWERS_OF_ADDRESS
 
     async def states(self, channel: Channel, after: str, address: str) -> AsyncIterator[str]:
-        """The states of a channel, for a page of an address; see :meth:`Channel.states`."""
+        """The states of a channel, for a page of an address, see :meth:`Channel.states`."""
         self._n_of_address[address] += 1
         try:
             async with contextlib.aclosing(channel.states(after)) as states:
@@ -116,15 +116,15 @@ class Live:
                     yield state
         finally:
             self._n_of_address[address] -= 1
-            self._n_of_address += Counter()  # without addresses that have none
+            self._n_of_address += Counter()  # removes addresses without connections
 
     @property
     def n_viewers(self) -> int:
-        """Number of connections that are open."""
+        """Number of open connections."""
         return sum(channel.n_viewers for channel in self._channels.values())
 
     def channel(self, day: str, name: str, quantity: str) -> Channel:
-        """The channel of a run with a quantity at the points of its scan; of the newest if both are empty."""
+        """The channel of a run and a quantity of its scan. If day and name are empty, of the newest run."""
         self._channels = {key: channel for key, channel in self._channels.items() if channel.n_viewers}
         key = f"{day}/{name}/{quantity}"
         if key not in self._channels:
@@ -132,20 +132,20 @@ class Live:
         return self._channels[key]
 
     def state(self, day: str = "", name: str = "", quantity: str = "") -> dict[str, Any]:
-        """The state of a run, of the newest by default; with "error" if it cannot be read."""
+        """The state of a run. Default: the newest. If it cannot be read, "error" says why."""
         try:
             run = self._catalogue.open(day, name) if name else self._catalogue.newest()
             if run is None:
                 return {"run": None, "running": [], "alarms": [], "error": ""}
             return self.state_of(run).update(quantity) | {"running": self._catalogue.running(), "error": ""}
-        except Exception as error:  # noqa: BLE001 - whatever a damaged file leads to, the page must stay
+        except Exception as error:  # noqa: BLE001 - the page must stay, whatever a damaged file causes
             is_known = isinstance(error, LabseqError | OSError | NoSuchRun)
             text = text_of(error if is_known else format_error(error))
             alarms = [alarm("error", "This cannot be shown", text)]
             return {"run": None, "running": [], "alarms": alarms, "error": text}
 
     def state_of(self, run: OpenRun) -> RunState:
-        """What is known of a run; that of the last eight is kept."""
+        """The state of a run, kept for the last eight runs."""
         state = self._states.get(run.id)
         if state is None or state.run is not run:
             state = self._states[run.id] = RunState(run, self._limits)

@@ -1,4 +1,4 @@
-"""The runs of a data folder: the list, and what the pages need of each run."""
+"""The runs of a data folder: the list, and the data of each run that the pages need."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from labseq.web.history import RunHistory, judged_values
 MAX_TEXT: Final = 2000
 """Maximum number of characters of a text from a file that is passed on."""
 SEARCH_S: Final = 4.0
-"""Longest time of a search, in seconds. What it has read of runs is kept, so the next one gets further."""
+"""Time limit of a search, in seconds. Runs that were read are kept, so the next search gets further."""
 _MAX_SUMMARIES: Final = 2000
 _LISTED_S: Final = 0.5
-"""Shortest time after which the list of folders is read again, in seconds."""
+"""Minimum time before the list of folders is read again, in seconds."""
 _DAY: Final = re.compile(r"\d{4}-\d\d-\d\d")
 _LISTED_EVENTS: Final = frozenset(
     {"warning", "safe_state", "closed", "shot_repeated", "window_too_short", "window_exceeded"}
@@ -46,7 +46,7 @@ _LISTED_EVENTS: Final = frozenset(
 
 
 def text_of(value: object, most: int = MAX_TEXT) -> str:
-    """A text from a file: of limited length, control characters as escapes, lines kept."""
+    """A text from a file, with limited length and escaped control characters. Line breaks are kept."""
     text = str(value)
     text = text if len(text) <= most else f"{text[:most]} ..."
     return "\n".join(visible(line.replace("\t", "    ")) for line in text.split("\n"))
@@ -57,7 +57,7 @@ class NoSuchRun(LookupError):  # noqa: N818 - a missing page is not a failure
 
 
 class OpenRun:
-    """A run whose files are followed while it is written.
+    """A run whose files are followed while it writes them.
 
     Args:
         folder: The run's folder.
@@ -81,7 +81,7 @@ class OpenRun:
         """The content of run.json.
 
         Raises:
-            RecordingError: It is damaged.
+            RecordingError: run.json is damaged.
         """
         stamp = _stamp(self.folder / RUN_FILE)
         if stamp != self._record_stamp or not self._record:
@@ -95,7 +95,7 @@ class OpenRun:
         """The target of the run.
 
         Raises:
-            RecordingError: It is damaged.
+            RecordingError: run.json is damaged.
         """
         return target_of(self.folder / RUN_FILE, self.record)
 
@@ -109,7 +109,7 @@ class OpenRun:
         with reporting_damage(self.folder):
             measured = names_measured(self.record.get("resolved") or {}, self.target)
             names = dict.fromkeys((*measured, *(() if self.target.is_none else WITH_TARGET)))
-            # a damaged or older record may name what this version does not know
+            # a damaged or older record may have names that this version does not know
             return tuple(one for one in names if quantity_problem(one, (one,), (), self.target) is None)
 
     def _series(self) -> list[Series]:
@@ -119,7 +119,7 @@ class OpenRun:
         """Read what was added to the event log.
 
         Raises:
-            RecordingError: It cannot be read.
+            RecordingError: The event log cannot be read.
         """
         for event in self.follower.log():
             with suppress(TypeError, ValueError):  # a damaged line
@@ -140,7 +140,7 @@ class OpenRun:
             del self.events[:-40]
 
     def with_rows(self, lines: Iterable[int]) -> list[Shot]:
-        """The shots of some lines of the index; those that cannot be read are left out."""
+        """The shots of some lines of the index. Unreadable lines are left out."""
         shots = list[Shot]()
         for line in lines:
             with suppress(RecordingError):
@@ -156,11 +156,11 @@ class OpenRun:
         return self.follower.shot(self.history.row(line))
 
     def some(self, lines: Iterable[int]) -> Run:
-        """The run with the shots of some lines of the index alone, which is fast for any number of shots."""
+        """The run with only the shots of some lines of the index, which is fast for any number of shots."""
         return Run(self.folder, self.record, *read_state(self.folder), tuple(self.with_rows(lines)), ())
 
     def outline(self) -> Run:
-        """The run whose shots have nothing but their index, which is fast for any number of shots."""
+        """The run with shots that have nothing but an index, which is fast for any number of shots."""
         counted = self.history.columns()
         first = self.with_rows(counted.counted[:1].tolist())
         shots = (
@@ -206,7 +206,7 @@ class Catalogue:
             return self._folders
 
     def newest(self) -> OpenRun | None:
-        """The newest run in progress, else the newest; None without one.
+        """The newest run in progress, or else the newest run. None without runs.
 
         Raises:
             RecordingError: The data folder cannot be read.
@@ -247,11 +247,11 @@ class Catalogue:
             return run
 
     def summary(self, folder: Path) -> dict[str, Any]:
-        """A run as a line of the list; it is read again only if one of its files has changed."""
+        """A run as an entry in the list. It is read again only if one of its files has changed."""
         names = (RUN_FILE, STATE_FILE, INDEX_FILE, NOTES_FILE)
         stamp = [_stamp(folder / name) for name in names]
         cached = self._summaries.get(folder)
-        # a run that died still says "running": its process has to be looked at each time
+        # a run that died still says "running", so its process must be checked each time
         if cached is not None and cached[0] == stamp and cached[1]["status"] != "running":
             return cached[1]
         run = self._open.get(str(folder))
@@ -263,7 +263,7 @@ class Catalogue:
         return values
 
     def _results(self, folder: Path) -> dict[str, Any]:
-        """What a run that has ended scanned and measured, as `labseq runs` shows it."""
+        """The scanned values and results of a run that has ended, as `labseq runs` shows them."""
         entry = next(entries(self.root, [_day_and_name(folder)]))
         return {
             "scanned": text_of(entry.scanned_text, 400),
@@ -278,7 +278,7 @@ class Catalogue:
             if (newest := self.newest()) is not None:
                 newest.history.update()
             names = [_day_and_name(folder) for folder in self.folders()[::-1]]
-            for first in range(0, len(names), 100):  # what was read is kept after each hundred
+            for first in range(0, len(names), 100):  # every hundred entries are cached
                 for _ in entries(self.root, names[first : first + 100]):
                     time.sleep(0.001)
 
@@ -287,8 +287,8 @@ class Catalogue:
 
         Args:
             text: Words that date, name, profile, results, comment or tags must contain.
-            status: Only runs of this status; "" for all.
-            first: Number of newer ones to leave out.
+            status: Only runs with this status. "" for all.
+            first: Number of newer runs to leave out.
             most: Maximum number of runs.
 
         Raises:
@@ -322,7 +322,7 @@ def _day_and_name(folder: Path) -> tuple[str, str]:
 
 
 def run_id(folder: Path) -> str:
-    """The name by which commands and pages know a run."""
+    """The name of a run in commands and pages."""
     return f"{folder.parent.name}/{folder.name}"
 
 

@@ -1,4 +1,4 @@
-"""The scan of a run as its points fill: its axes, quantities at each point, and their fits."""
+"""The scan of a run while its points fill: axes, quantities at each point, and fits."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from labseq.web.runs import OpenRun, text_of
 from labseq.web.series import about_quantity, finite, mean_values
 
 _MAX_POINTS: Final = 2000
-"""Maximum number of points of a scan, and of visits of points."""
+"""Maximum number of points of a scan, and of visits to points."""
 _SHARE: Final = 0.2
-"""Greatest share of the time that is spent on computing the values of a scan."""
+"""Maximum share of the time that is spent on computing the values of a scan."""
 
 
 class ScanView:
@@ -32,7 +32,7 @@ class ScanView:
 
     Args:
         run: The run.
-        quantity: Name of the only quantity to show; "" for those of the run's page.
+        quantity: Name of the only quantity to show. "" for the quantities of the run's page.
 
     Raises:
         ConfigError: The run has no such quantity.
@@ -57,7 +57,7 @@ class ScanView:
 
     @property
     def is_busy(self) -> bool:
-        """Whether it changes without new shots: a fit is being computed, or files are still to be read."""
+        """Whether it changes without new shots, because a fit is being computed or files are still unread."""
         is_reading = self._own is not None and self._own.n_unread > 0
         return is_reading or not all(fit.is_ready for fit in self._fits.values())
 
@@ -70,7 +70,7 @@ class ScanView:
         return self._values if time.monotonic() < self._next_s else self.values(read_s)
 
     def values(self, read_s: float) -> dict[str, Any]:
-        """The scan as the files are now, JSON-ready; "error" if it cannot be shown.
+        """The scan as the files are now, JSON-ready. If it cannot be shown, "error" says why.
 
         Args:
             read_s: Time that may be spent on reading the files of shots, in seconds.
@@ -134,18 +134,18 @@ class ScanView:
 
 
 def _first_shots(run: OpenRun) -> Any:
-    """The run with its first shots, in which names of images and columns are looked up."""
+    """The run with its first shots, in which to look up names of images and columns."""
     return run.some(run.history.columns().counted[:3].tolist())
 
 
 def _choices(run: OpenRun) -> list[str]:
-    """The quantities that the page offers: shown ones, survival between images, columns, results."""
+    """The quantities that the page offers: shown quantities, survival between images, columns, results."""
     first = _first_shots(run)
     return [*dict.fromkeys((*run.shown, *_survivals(first), *column_names(first)))]
 
 
 def map_choices(run: OpenRun) -> list[str]:
-    """The quantities that have a value at each site: shown ones, survival, loading, filling."""
+    """The quantities with a value at each site: shown quantities, survival, loading, filling."""
     first = _first_shots(run)
     of_images = [name for name in run.shown if parse_name(name).kind in OF_IMAGES]
     filling = [] if run.target.is_none else [f"filling:{image}" for image in image_names(first)]
@@ -178,7 +178,7 @@ def _point(point: ScanPoint, place: tuple[int, ...], means: list[Estimated]) -> 
 
 
 def _adaptive(run: OpenRun) -> dict[str, Any]:
-    """What the scanner optimises, its value at each visit of a point, and the best so far."""
+    """The quantity that the scanner optimises, its value at each visit to a point, and the best so far."""
     scan = run.record["scan"]
     visits = [
         {"point": event.get("point"), "value": event.get("value"), "written": _texts(event.get("written"))}

@@ -12,7 +12,7 @@ from labseq.model.estimate import Estimated, Rate
 
 
 def about_quantity(quantity: Quantity, values: Sequence[float]) -> dict[str, Any]:
-    """A quantity for the pages: its name, and the unit in which these values are readable; for JSON."""
+    """A quantity for JSON: its name, and the unit in which these values are easy to read."""
     unit, factor = shown_unit(quantity, values)
     return {
         "name": quantity.name,
@@ -35,7 +35,7 @@ def interval_of(value: Estimated) -> list[float | None]:
 
 
 def mean_values(value: Estimated) -> dict[str, Any]:
-    """A mean for JSON: its 68 % interval and, of a rate, the events and trials."""
+    """A mean for JSON: its 68 % interval and, for a rate, the numbers of events and trials."""
     is_known = not math.isnan(value.value)
     counts = {"n": value.n, "n_trials": value.n_trials} if isinstance(value, Rate) else {}
     return {

@@ -33,17 +33,17 @@ _PORTS: Final = 20
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """How the server is reached.
+    """Settings of the server.
 
     Attributes:
-        host: Address that it listens on.
-        port: Port that it listens on; 0 for any that is free.
-        names: Further names of the server, such as that of a proxy.
+        host: Address to listen on.
+        port: Port to listen on. 0 for any free port.
+        names: Further names of the server, such as the name of a proxy.
         certificate: PEM file of the certificate, for TLS.
         key: PEM file of its key.
-        control: Whether visitors may act.
+        control: Whether visitors may make changes.
         calibration_age_s: Age of a calibration in use at which an alarm is raised.
-        ends_with: Process id; the server ends when this process does. None: at Ctrl-C.
+        ends_with: Process id. The server ends when this process does. None: at Ctrl-C.
     """
 
     host: str = HOST
@@ -122,10 +122,10 @@ def check_packages() -> None:
 
 
 def _tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
-    """The certificate and its key; None without a certificate.
+    """The certificate and its key. None without a certificate.
 
     Raises:
-        ConfigError: A file is missing, or is not what it should be.
+        ConfigError: A file is missing, or is not a certificate or key.
     """
     for path in (certificate, key):
         if path is not None and not path.is_file():
@@ -143,7 +143,7 @@ def _tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
 
 
 def _listener(host: str, port: int) -> socket.socket:
-    """A socket that listens.
+    """Open a listening socket.
 
     Raises:
         ConfigError: The address is wrong, or the port is taken.
@@ -157,7 +157,7 @@ def _listener(host: str, port: int) -> socket.socket:
         listener.listen(128)
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        hint = "choose another one with --port; perhaps the server is already running"
+        hint = "choose another port with --port, unless the server is already running"
         raise ConfigError(Problem(f"{host}:{port} cannot be used: {reason}", hint=hint)) from error
     return listener
 
@@ -171,7 +171,7 @@ def _greeting(root: Path, serving: Serving, port: int, token: str) -> list[str]:
     lines = [f"{scheme}://{host}:{port}/{query}", f"shows {root}; Ctrl-C ends it"]
     if not is_loopback(serving.host) and not serving.certificate:
         lines.append(
-            "warning: without TLS, everybody in this network can read all traffic, including the token"
+            "warning: without TLS, everybody on this network can read all traffic, including the token"
         )
     return lines
 
@@ -195,10 +195,10 @@ def _process(pid: int) -> Process | None:
 
 
 def start_for_run(root: Path) -> str:
-    """Start a server for a run in a process of its own, unless there is one for this data folder.
+    """Start a server for a run in its own process, unless this data folder already has one.
 
     Returns:
-        The lines to print: its address, and when it ends.
+        The line to print, with the address and when it ends.
 
     Raises:
         ConfigError: There is no free port, or a package is missing.
@@ -213,14 +213,14 @@ def start_for_run(root: Path) -> str:
             return f"{address} shows this run"
         if not is_taken:
             pid = _spawn(root, port)
-            return f"{address} shows this run (process {pid}; it ends with this terminal)"
+            return f"{address} shows this run (process {pid}, which ends with this terminal)"
     raise ConfigError(
         Problem(f"the ports {PORT} to {PORT + _PORTS - 1} are taken", hint="start `labseq web`")
     )
 
 
 def _serves(address: str, root: Path) -> bool:
-    """Whether a server of this data folder answers there."""
+    """Whether a server for this data folder answers at an address."""
     address = f"{address}api/v1/server"
     with suppress(OSError, ValueError, KeyError), urllib.request.urlopen(address, timeout=2.0) as answer:  # noqa: S310 - loopback
         return bool(json.loads(answer.read(10_000))["data"] == visible(str(root)))
@@ -248,5 +248,5 @@ def _spawn(root: Path, port: int) -> int:
     process = subprocess.Popen(  # noqa: S603 - this Python
         command, stdin=nothing, stdout=nothing, stderr=nothing, **own_group
     )
-    process.returncode = 0  # it outlives the run: keep Popen from warning that it was not waited for
+    process.returncode = 0  # it outlives the run, so Popen must not warn that it was not waited for
     return process.pid

@@ -1,4 +1,4 @@
-"""One shot for the pages: images, cycle by cycle moves, times and readings; frames as 8-bit PNG."""
+"""One shot for the pages: images, moves of each cycle, times and readings, and frames as 8-bit PNG."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from labseq.web.runs import text_of
 from labseq.web.series import finite
 
 _RANGE: Final = (0.01, 0.998)
-"""Fractions of the pixels below black and white."""
+"""Fractions of the pixels that are drawn below black and below white."""
 
 
 def shot_values(shot: Shot, record_frames: str) -> dict[str, Any]:
-    """A shot, JSON-ready.
+    """A shot as JSON-ready values.
 
     Args:
         shot: The shot.
         record_frames: Which frames the run keeps: "all", "last" or "none".
 
     Raises:
-        RecordingError: Its file is missing or damaged.
+        RecordingError: The shot's file is missing or damaged.
     """
     images, target = shot.images, shot.target
     recorded = {"all": range(len(images)), "last": range(len(images))[-1:]}.get(record_frames, range(0))
@@ -73,7 +73,7 @@ def shot_values(shot: Shot, record_frames: str) -> dict[str, Any]:
 
 
 def readings_of(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Single values by name, texts of limited length."""
+    """Single values by name. Texts have limited length."""
     plain: dict[str, Any] = to_plain(values)
     return {
         text_of(name, 120): text_of(value, 200) if isinstance(value, str | list | dict) else value
@@ -137,11 +137,11 @@ def _cached_png(path: Path, _sha256: str, image: int, width: int) -> tuple[bytes
 
 
 def reduced(frame: NDArray[np.uint16], factor: int) -> NDArray[np.uint8]:
-    """A frame in 8 bit, its darkest pixels black and its brightest white.
+    """Convert a frame to 8 bit, with its darkest pixels black and its brightest white.
 
     Args:
         frame: uint16 (height, width).
-        factor: Height and width of the squares of pixels that become one.
+        factor: Height and width of the squares of pixels that become one pixel.
     """
     height, length = (n - n % factor for n in frame.shape)
     if factor > 1 and height and length:
@@ -159,6 +159,6 @@ def reduced(frame: NDArray[np.uint16], factor: int) -> NDArray[np.uint8]:
 def encode_png(grey: NDArray[np.uint8]) -> bytes:
     """A grey PNG of uint8 (height, width)."""
     file = io.BytesIO()
-    # frames are mostly noise: a better compression takes twice the time and saves nothing
+    # frames are mostly noise, so better compression takes twice the time and saves nothing
     Image.fromarray(grey).save(file, "PNG", compress_level=1, compress_type=zlib.Z_RLE)
     return file.getvalue()

@@ -1,4 +1,4 @@
-"""What the page of a run shows while it runs: figures, trend, stages, losses, last shot, alarms, scan."""
+"""The state of a run for its page: figures, trend, stages, losses, last shot, alarms and scan."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from labseq.web.shots import rows_of, shot_values
 N_BINS: Final = 40
 """Maximum number of points of a trend."""
 _OPEN_S: Final = 0.5
-"""Minimum time between opening shots, in seconds: reading a shot's file takes 10 to 20 ms of CPU."""
+"""Minimum time between opening shots, in seconds, as reading a shot's file takes 10 to 20 ms of CPU."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +44,8 @@ class Limits:
     """When the page raises an alarm.
 
     Attributes:
-        calibration_s: Greatest age of a calibration in use, in seconds.
-        free_gb: The disk is nearly full if it has fewer GB free.
+        calibration_s: Maximum age of a calibration in use, in seconds.
+        free_gb: Free space in GB below which the disk counts as nearly full.
     """
 
     calibration_s: float = 7 * 86_400.0
@@ -53,7 +53,7 @@ class Limits:
 
 
 class RunState:
-    """The state of a run, brought up to date by :meth:`update`.
+    """The state of a run, updated by :meth:`update`.
 
     Args:
         run: The run.
@@ -75,7 +75,7 @@ class RunState:
         """The state as the files are now, JSON-ready.
 
         Args:
-            quantity: Name of the only quantity at the points of the scan; "" for those that the run measures.
+            quantity: The only quantity at the points of the scan. "" for all that the run measures.
 
         Raises:
             RecordingError: run.json is damaged, or a file cannot be read.
@@ -110,13 +110,13 @@ class RunState:
         return taken_s / n_new * max(0, head["n_shots"] - head["n_done"])
 
     def _open_shots(self, record: Mapping[str, Any], status: str, columns: Columns) -> None:
-        """Read the newest shots, but not too often during a run: a later update reads the rest."""
+        """Read the newest shots, but not too often during a run. A later update reads the rest."""
         lines = len(columns.shot)
         is_too_soon = status == "running" and time.monotonic() - self._opened_s < _OPEN_S
         if lines == self._n_opened or is_too_soon:
             return
         self._opened_s, self._shot_error = time.monotonic(), ""
-        n_newest = 1 if self._n_opened else 20  # enough for the stages; older files are not read
+        n_newest = 1 if self._n_opened else 20  # enough for the stages, so older files are not read
         # the last shot that counts is shown, even if attempts at the next one have failed since
         good = int(columns.counts.nonzero()[0].max(initial=-1))
         newest = {*range(max(self._n_opened, lines - n_newest), lines), max(good, self._n_opened)}
@@ -145,10 +145,10 @@ class RunState:
         return stage_rows(totals, simulated=bool(record["simulated"]))
 
     def scan(self, quantity: str, most_s: float) -> dict[str, Any] | None:
-        """The scan of the run with a quantity, or with those that the run measures; None without a scan.
+        """The scan of the run with one quantity or with all that the run measures. None without a scan.
 
         Args:
-            quantity: Its name; "" for those that the run measures.
+            quantity: Name of the quantity. "" for all that the run measures.
             most_s: Maximum time to wait for fits and for files of shots, in seconds.
 
         Raises:
@@ -157,7 +157,7 @@ class RunState:
         """
         end_s = time.monotonic() + most_s
         while True:
-            with self.run.lock:  # not for the whole time: pages need it
+            with self.run.lock:  # not for the whole time, as pages need it
                 self.run.history.update()
                 self.run.read_events()
                 if not self.run.record.get("scan"):
@@ -182,7 +182,7 @@ class RunState:
             view = self._scan(quantity)
         except ConfigError as error:  # no such quantity
             return {"error": text_of(error, 600)}
-        # a run needs its processor more
+        # a run in progress needs the processor more
         return {**view.recent(read_s=0.03 if status == "running" else 0.3), "is_busy": view.is_busy}
 
     def _alarms(
@@ -262,7 +262,7 @@ def figures_of(columns: Columns) -> dict[str, Any]:
 
 
 def losses_of(columns: Columns) -> list[dict[str, Any]]:
-    """Atoms lost per shot by cause, the greatest first; empty on real hardware."""
+    """Atoms lost per shot by cause, the largest first. Empty on real hardware."""
     losses = [
         {"cause": text_of(cause.replace("_", " "), 60), "mean": value.value, "error": finite(value.error)}
         for cause, value in columns.losses.items()
@@ -272,7 +272,7 @@ def losses_of(columns: Columns) -> list[dict[str, Any]]:
 
 
 def stage_rows(totals: StageTotals, *, simulated: bool) -> list[dict[str, Any]]:
-    """Stages of the latest shots: host times in a simulated run, as measured on real hardware."""
+    """Stages of the latest shots. In a simulated run with host times, as measured on real hardware."""
     rows = list[dict[str, Any]]()
     for stage in totals.stages():
         shown_s = stage.host_s if simulated else stage.session_s
@@ -314,19 +314,19 @@ def _run_alarms(run: OpenRun, status: str, error: str, columns: Columns) -> list
             text = f"the last: shot {row.shot}, {row.status}: {text_of(row.error, 300)}"
         alarms.append(alarm("warning", f"{plural(n_failed, 'attempt')} at a shot failed", text))
     if run.history.n_damaged:
-        text = "they are left out here; `labseq doctor` repairs what can be repaired"
+        text = "these lines are left out here; repair them with `labseq doctor`"
         alarms.append(
             alarm("warning", f"{plural(run.history.n_damaged, 'line')} of the index cannot be read", text)
         )
     if status == "running" and (silent_s := _silent_s(run, columns)):
         alarms.append(
-            alarm("warning", f"No shot for {age_text(silent_s)}", "the process of the run is still there")
+            alarm("warning", f"No shot for {age_text(silent_s)}", "the process of the run is still running")
         )
     return alarms
 
 
 def _silent_s(run: OpenRun, columns: Columns) -> float:
-    """Time without a new shot, if it is much longer than one takes; else 0."""
+    """Time without a new shot if it is much longer than a shot takes, or else 0."""
     try:
         silent_s = time.time() - (run.folder / INDEX_FILE).stat().st_mtime
     except OSError:

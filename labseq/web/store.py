@@ -21,7 +21,7 @@ from labseq.web.series import finite
 
 
 def queue_values(root: Path) -> dict[str, Any]:
-    """The queue of a data folder, JSON-ready; "error" if an entry is damaged."""
+    """The queue of a data folder, JSON-ready. If an entry is damaged, "error" says so."""
     queue = Queue(root)
     holder = queue.lock().holder() if queue.folder.is_dir() else None
     is_run = holder is not None and holder.is_running
@@ -64,10 +64,10 @@ def calibrations(catalogue: Catalogue) -> dict[str, Any]:
 
 
 def calibration_picture(catalogue: Catalogue, store: str, file: str) -> bytes | None:
-    """The PNG of a calibration; None if there is none.
+    """The PNG of a calibration. None if it does not exist.
 
     Raises:
-        RecordingError: It cannot be read.
+        RecordingError: The file cannot be read.
     """
     entry = _stores(catalogue).get(store)
     if entry is None or Path(file).name != file:
@@ -103,7 +103,7 @@ def _folder_of(record: Mapping[str, Any]) -> Path:
 
 
 def _key(folder: Path) -> str:
-    """What stands for a folder in an address, which should not contain a path."""
+    """A key that replaces a folder in an address, which should not contain a path."""
     return hashlib.sha256(str(folder).encode("utf-8", "replace")).hexdigest()[:12]
 
 
