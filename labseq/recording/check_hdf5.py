@@ -184,7 +184,6 @@ def check_type(kind: Any, place: str, expected: Mapping[str, str] | None = None,
 
     Raises:
         ValueError: The type is not allowed.
-        ValueError: It is another type.
     """
     if isinstance(kind, h5t.TypeCompoundID):
         for i in range(kind.get_nmembers()):
