@@ -92,14 +92,14 @@ def _write_files(group: h5py.Group, run_dir: Path) -> list[str]:
                 if not path.resolve().is_relative_to(run_dir.resolve()):
                     left_out.append(f"{path}: is a link to a file outside this run; it was not copied")
                     continue
-                # no text or picture is that large; a larger file would fill the memory
+                # no text or picture is that large, and a larger file would fill the memory
                 _write_file(goal, plain_text(path.name), read_file(path, 1 << 30))
     return left_out
 
 
 def _write_file(group: h5py.Group, name: str, data: bytes) -> None:
     try:
-        # a text has no zero bytes; other files may be valid UTF-8 by chance
+        # a text has no zero bytes, but other files may be valid UTF-8 by chance
         text = data.decode() if b"\0" not in data else None
     except ValueError:
         text = None
@@ -146,7 +146,7 @@ class _Shots:
                 set_attributes(copy, {"default": "detection"})
 
     def _share(self, source: Any, copy: Any, name: str) -> None:
-        # compared by content: each shot's file has a copy of its own
+        # compared by content, because each shot's file has its own copy
         content = {
             key: str(value[()]) if value.ndim == 0 else value[()].tobytes() for key, value in source.items()
         }

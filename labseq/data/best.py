@@ -114,7 +114,7 @@ def best_point(run: Run) -> BestPoint | None:
         axis.at(place + step) if step else measured[best][0].parameters[axis.address]
         for axis, place, step in zip(ranges, places[best].tolist(), steps.tolist(), strict=True)
     ]
-    suggested = {  # a fit is not good to more than four digits; a taken point is given exactly
+    suggested = {  # a fit gets four digits because it is no better, a taken point is exact
         axis.address: written(float(f"{value:.4g}") if step and not axis.n_steps else value, unit)
         for axis, value, unit, step in zip(ranges, values, units, steps.tolist(), strict=True)
     }

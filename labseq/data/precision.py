@@ -45,7 +45,7 @@ def read_limit(written: float | str, unit: str) -> ErrorLimit:
     number, written_unit = split_quantity(text)
     dimension = "" if dimension_of(unit) == "fraction" else dimension_of(unit)
     if math.isnan(number) or number <= 0:
-        raise ValueError(f"'{clean(text)}' is not an error")
+        raise ValueError(f"'{clean(text)}' is not a valid error")
     if written_unit == "":
         if dimension:
             raise ValueError(f"'{clean(text)}' has no unit")

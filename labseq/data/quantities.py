@@ -277,7 +277,7 @@ def names_measured(resolved: Mapping[str, Any], target: TargetPattern) -> tuple[
     if names := measured_in(resolved):
         return names
     steps: list[StepSummary] = []
-    for step in resolved.get("shot", ()):  # of an earlier version: kind -> settings, with a name
+    for step in resolved.get("shot", ()):  # from an earlier version: kind -> settings, with a name
         kind = next((key for key in step if key not in ("name", "policy")), "")
         steps.append(StepSummary(step.get("name") or kind, kind == "image", kind == "load"))
     # even shots without images have a duration

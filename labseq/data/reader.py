@@ -108,7 +108,7 @@ class Run:
     def __repr__(self) -> str:
         return f"<Run {self.path}: {len(self.shots)} of {self.n_shots} shots, {self.status}>"
 
-    # methods import what they need: a run that is being taken is opened, too, and needs none of it
+    # methods import what they need, because a run that is being taken is opened, too, and needs none of it
 
     @property
     def name(self) -> str:

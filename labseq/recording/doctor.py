@@ -294,7 +294,7 @@ class _Check:
             self._add(what, path, "marked as interrupted", replace)
         elif state["state"] == "running":
             ended = {**state, "state": "failed", "error": "interrupted: the process that ran it is gone"}
-            what = "the run has no end, and its process is gone"
+            what = "the run did not end, and its process is gone"
             data = dumps(ended).encode() + b"\n"
             self._add(what, path, "marked as interrupted", lambda: write_file(path, data))
 
@@ -369,7 +369,7 @@ class _Check:
                     Finding(what, path, "left: close it there, then run this again", left=True)
                 )
         elif not good:
-            what = "the checksum does not hold: a byte has changed since it was written"
+            what = "the checksum does not match: the file has changed since it was written"
             if n_bytes < last.bytes:
                 what = f"the shot's file is cut off: {n_bytes} of {last.bytes} bytes"
             remedy = f"{_TO_QUARANTINE}, with its line"

@@ -143,7 +143,7 @@ def test_what_is_quarantined_says_where_it_came_from(run_dir: Path) -> None:
     assert sorted(path.name for path in place.iterdir()) == ["doctor.jsonl", "index.jsonl", "shot_000001.h5"]
     first = json.loads((place / "doctor.jsonl").read_text("utf-8").splitlines()[0])
     assert first["from"] == str(run_dir / "shots" / "shot_000001.h5")
-    assert first["what"].startswith("the checksum does not hold")
+    assert first["what"].startswith("the checksum does not match")
 
 
 def test_what_is_moved_to_quarantine_is_on_the_disk(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -180,7 +180,7 @@ SCANNED = HEAD.replace("shots: 2\n", "repeats: 40\norder: shuffled\n") + SCAN.re
             "7:66: '2' has no unit; expected the error to reach: 2 % of the value, or 0.1 s",
         ),
         ("stop_when: {decay: 2 mV}", "7:66: '2 mV' does not have the unit of the parameter"),
-        ("stop_when: {decay: 0 %}", "7:66: '0 %' is not an error"),
+        ("stop_when: {decay: 0 %}", "7:66: '0 %' is not a valid error"),
         ("stop_when: {offset: 2 %}", "7:59: 'offset' is fixed"),
     ],
 )

@@ -22,7 +22,7 @@ export async function showRuns(main, _, asked) {
     try {
       const answer = await getJson(`/runs?${query}`);
       history.replaceState(null, "", `/runs?${new URLSearchParams([...query].filter(([key, value]) => value && key !== "n" && value !== "0"))}`.replace(/\?$/, ""));
-      const unread = answer.n_unread ? `; ${count(answer.n_unread, "run")} still to be read` : "";
+      const unread = answer.n_unread ? `; ${count(answer.n_unread, "run")} not read yet` : "";
       note.textContent = `${answer.n_found} of ${count(answer.n_runs, "run")}${unread}`;
       patch(found, answer.runs.length ? listOf(answer.runs) : el("p.hint", {}, answer.n_runs ? "No run has these words." : "There are no runs in this data folder yet."), pages(answer.n_found));
     } catch (error) { patch(found, failure(error)); }

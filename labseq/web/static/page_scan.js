@@ -30,7 +30,7 @@ function chooser(scan, quantity, onchange) {
   const names = [...new Set([...(quantity ? [quantity] : []), ...(scan.choices ?? [])])];
   return [el("label", {}, "Quantity ", el("select", { "aria-label": "Quantity", onchange },
     el("option", { value: "", selected: !quantity }, "what the run measures"), names.map((name) => el("option", { value: name, selected: name === quantity }, name)))),
-  scan.n_unread ? el("span.note", { role: "status" }, `${scan.n_unread} shots are still to be read`) : null];
+  scan.n_unread ? el("span.note", { role: "status" }, `${scan.n_unread} shots have not been read yet`) : null];
 }
 
 export async function scanOfRun(body, id) {
@@ -40,7 +40,7 @@ export async function scanOfRun(body, id) {
 }
 
 function drawScan(body, scan) {
-  if (!scan) { replace(body, panel("Scan", { class: "wide" }, el("p.hint", {}, "This run scans nothing. "), el("p.hint", {}, el("a", { href: "/runs?q=" }, "Runs with a scan")))); return; }
+  if (!scan) { replace(body, panel("Scan", { class: "wide" }, el("p.hint", {}, "This run has no scan. "), el("p.hint", {}, el("a", { href: "/runs?q=" }, "Runs with a scan")))); return; }
   if (scan.error) { replace(body, el("div.alarm.is-error", {}, el("strong", {}, "The scan cannot be shown"), el("span", {}, scan.error))); return; }
   if (!scan.points.length) { replace(body, panel("Scan", { class: "wide" }, el("p.hint", {}, "No point has a shot yet."))); return; }
   const parts = body.parts ??= makeParts(body, scan);
