@@ -106,7 +106,6 @@ def trend(
     """A panel with a quantity of each shot and its running mean with error. None if no shot has a value.
 
     Args:
-        name: Name of the quantity.
         shots: float64 (n,), indices of the shots.
         values: float64 (n,), a value for each shot, SI. nan if unknown.
         is_yes_or_no: True if each value is 0 or 1. The axis then goes from 0 to 100 %.
@@ -396,7 +395,6 @@ def stages_of_a_shot(title: str, stages: Sequence[StageStatistics], clocks: Mapp
     A point shows the median, a line reaches to the 99th percentile, and a mark shows the budget.
 
     Args:
-        title: Title of the panel.
         stages: The stages, at least one.
         clocks: "session_s" and perhaps "host_s" -> name of the clock.
     """
@@ -515,7 +513,6 @@ def set_labels(axis: Axis, labels: Sequence[str], room: int = 32, most: int = 24
     """Label the ticks at 0, 1, 2, ...
 
     Args:
-        labels: Texts of the labels.
         room: Labels with more characters than this in total are rotated.
         most: Maximum number of labels. If there are more, some are left out.
     """

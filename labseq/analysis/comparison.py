@@ -242,7 +242,6 @@ class Trend:
 
         Args:
             name: A fitted parameter, a quantity, or a setting that was changed by ``--set``.
-            data: The data folder.
             conditions: Arguments of that function.
 
         Raises:

@@ -252,10 +252,7 @@ def scan_panels(
     """A quantity against the scanned values: a curve for one axis, maps for more. Empty if it is unknown.
 
     Args:
-        scan: The points of the scan.
-        quantity: The quantity.
-        means: Its mean at each point.
-        fits: Its fits.
+        means: Mean of the quantity at each point.
     """
     values = [mean.value for mean in means if not math.isnan(mean.value)]
     if not values:
@@ -398,7 +395,6 @@ def map_picture(run: Run, names: Sequence[str]) -> RunPicture:
     """Quantities of the images at each site, and how far each site is from the mean.
 
     Args:
-        run: The run.
         names: The quantities. Empty for the quantities that the run measures.
 
     Raises:

@@ -59,8 +59,6 @@ def run_file(
 
     Args:
         run_session: Runs and shows a session, for runs that are taken one after the other.
-        file: The file.
-        folder: The campaign's folder.
         n_workers: Number of simultaneous runs, each in its own process.
         scheduler: Address of a dask cluster that takes the runs instead.
         cluster_keys: Folder of its certificates.

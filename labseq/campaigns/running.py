@@ -154,7 +154,6 @@ def open_session(
     """Open a run of a campaign, or resume it.
 
     Args:
-        folder: The campaign's folder.
         earlier: The folder of the run, if it was started before.
     """
     if earlier is not None:

@@ -169,7 +169,6 @@ class ArrayPair:
         """Draw two arrays as large as possible. Return only a note if there is no room.
 
         Args:
-            titles: The titles above the arrays.
             arrays: Both occupancies, bool (n_rows, n_cols).
             marked: Sites of each array that are shown inverted, int16 (n, 2).
         """

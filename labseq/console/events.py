@@ -73,13 +73,7 @@ class LogLines:
 
 
 class MeasuredResults:
-    """A measured result of an analysis, which comes later than its shot and has its own line.
-
-    Args:
-        run_dir: The run's folder.
-        analysis: Name of the analysis.
-        key: Name of the result.
-    """
+    """A measured result of an analysis, which comes later than its shot and has its own line."""
 
     def __init__(self, run_dir: Path, analysis: str, key: str) -> None:
         self._key = key

@@ -113,7 +113,6 @@ def entries(root: Path, names: Iterable[tuple[str, str]], words: Sequence[str] =
     the name of its table when the meaning of a cached value changes.
 
     Args:
-        root: The data folder.
         names: Day and name of each run.
         words: Only entries whose text contains all of these words, in lower case.
     """

@@ -112,8 +112,6 @@ class FitModel:
         """Fit the parameters that are not fixed. None if the fit does not converge.
 
         Args:
-            points: The points.
-            fixed: The parameters that are fixed.
             near: An earlier solution from which the fit starts.
         """
         free = [name for name in self.units if name not in fixed]

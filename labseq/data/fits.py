@@ -112,7 +112,6 @@ def fit_points(
     """Fit a model to points, weighted with their errors.
 
     Args:
-        name: Name of the model.
         x: The scanned values, SI.
         values: A mean at each scanned value. Those that are nan are left out.
         units: SI units of x and of the values. "%" for a fraction.

@@ -40,7 +40,6 @@ class Follower:
     """Reads what a run has added to its index and its event log since the last call.
 
     Args:
-        run_dir: The run's folder.
         clock: Clock of this computer in seconds.
     """
 

@@ -93,8 +93,6 @@ def make_quantity(
     """Make the quantity for a name that has been checked.
 
     Args:
-        name: Name of the quantity.
-        target: The target of the run.
         results: The results of analyses: name -> shot -> value.
     """
     kind = parse_name(name).kind
@@ -143,7 +141,6 @@ def quantity_problem(
     """The problem with the name of a quantity, what was expected, and a hint. None if it is valid.
 
     Args:
-        name: The name.
         columns: The known names of quantities without images.
         images: The known names of images. Empty to accept any.
         target: The target of the run. None if it is not known.

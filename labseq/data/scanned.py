@@ -218,11 +218,7 @@ def fits_along(
     """Fit a quantity along one axis, at each combination of values of the other axes.
 
     Args:
-        run: The run.
-        scan: The points of its scan.
-        quantity: The quantity.
-        means: Its mean at each point, see :meth:`Scanned.over`.
-        request: What to fit.
+        means: Mean of the quantity at each point, see :meth:`Scanned.over`.
 
     Raises:
         ConfigError: There is no such axis, or every fit failed.

@@ -30,10 +30,6 @@ class Series:
 
     Values that the index lacks are added later. Results of analyses come after their shots. Files of shots
     take 10 to 20 ms each to read, so only :meth:`read_files` reads them.
-
-    Args:
-        quantity: The quantity.
-        run_dir: The run's folder.
     """
 
     def __init__(self, quantity: Quantity, run_dir: Path) -> None:

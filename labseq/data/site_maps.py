@@ -69,7 +69,6 @@ def site_map(run: Run, name: str, shots: Sequence[Shot] | None = None) -> SiteMa
     """Map a quantity of images over the sites.
 
     Args:
-        run: The run.
         name: A quantity of images: "survival:before,after", "loading", "filling:before@corner".
         shots: Some of its shots. Default: all. Every shot's file is read, and damaged ones are left out.
 

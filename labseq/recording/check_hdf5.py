@@ -67,7 +67,6 @@ def check_file(file: Any, path: Path, only: str = "") -> None:
 
     Args:
         file: The opened file. Only its structure is read.
-        path: Its path.
         only: The one dataset or group that will be read, such as "/entry/detection". "" for all.
 
     Raises:
@@ -121,7 +120,6 @@ def _check_dataset(dataset: Any, place: str, n_bytes: int, lengths: dict[str, in
     """Check a dataset.
 
     Args:
-        dataset: The opened dataset.
         place: Its path in the file.
         n_bytes: Size of the file.
         lengths: Axis -> its length in earlier datasets. New axes are added.
@@ -177,7 +175,6 @@ def check_type(kind: Any, place: str, expected: Mapping[str, str] | None = None,
     file that holds texts of variable length is damaged, HDF5 reads them without end.
 
     Args:
-        kind: The type.
         place: Its place in the file, for the message.
         expected: Column, or "" for an array -> kind of its numbers. Other columns may have any kind.
         name: The column.

@@ -326,9 +326,7 @@ class _Check:
 
         Args:
             path: The file. Later takes of a shot come before earlier ones.
-            run_id: The run's id.
             file_of: Shot -> the file that counts. The shot is added.
-            index: The index.
         """
         row = self._row_of_stray(path, run_id)
         if row is None:

@@ -191,8 +191,6 @@ def row_of_record(
     A scanner thus chooses the same points in a resumed run as in an uninterrupted one.
 
     Args:
-        shot: The shot.
-        target: The target of the run.
         file: Its file, from the run's folder.
         sha256: Checksum of the file.
         n_bytes: Size of the file.

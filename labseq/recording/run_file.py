@@ -38,8 +38,6 @@ def check_version(path: Path, version: str, own_version: str) -> None:
     """Raise if the format of a file has another major version.
 
     Args:
-        path: The file.
-        version: The version in the file.
         own_version: The version that this labseq writes.
     """
     version = clean(version)

@@ -98,7 +98,6 @@ def _fields(text: str, **attributes: str) -> tuple[Field, ...]:
     """Make fields from lines of name, type and description. An indented line continues the previous one.
 
     Args:
-        text: The lines.
         **attributes: Name -> attribute of the record, if it has another name.
     """
     lines = re.sub(r"\n +", " ", textwrap.dedent(text).strip()).splitlines()

@@ -97,7 +97,6 @@ def iter_frames(path: Path, only: int | None = None) -> Generator[tuple[int, Fra
     """Read the frames one by one, with the index of the image of each, see :func:`read_frames`.
 
     Args:
-        path: The file.
         only: Index of the one image whose frame is read. None for all.
     """
     with opened(path, "/entry/camera") as entry:
@@ -125,7 +124,6 @@ def opened(path: Path, only: str = "") -> Generator[Any]:
     """Open a shot's file to read its group ``/entry``. An error in the body reports the file as damaged.
 
     Args:
-        path: The file.
         only: The one dataset or group that will be read. "" for any.
 
     Raises:

@@ -146,7 +146,6 @@ class Guard:
     """ASGI middleware that refuses requests that are not allowed.
 
     Args:
-        app: The application.
         access: Who may use it.
     """
 

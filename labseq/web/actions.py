@@ -41,9 +41,6 @@ class Actions:
     """The endpoints that change something.
 
     Sequences are checked in a separate process, so that the server stays small whatever plugins they use.
-
-    Args:
-        catalogue: The runs.
     """
 
     def __init__(self, catalogue: Catalogue) -> None:

@@ -45,7 +45,6 @@ class Api:
     """The endpoints that read data, together with the endpoints of actions.
 
     Args:
-        catalogue: The runs.
         limits: When alarms are raised.
         actions: Endpoints for changes. Empty if the server is read-only.
     """

@@ -37,7 +37,6 @@ def make_app(root: Path, access: Access | None = None, limits: Limits | None = N
     """The whole application, with its guard.
 
     Args:
-        root: The data folder.
         access: Who may use it. Default: everybody who can reach it, without changing anything.
         limits: When alarms are raised.
     """

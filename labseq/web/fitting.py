@@ -32,7 +32,6 @@ class LiveFit:
     """A fit that is repeated as the points change. Its methods are called under the lock of the run.
 
     Args:
-        quantity: The quantity.
         measure: The entry of ``measure`` in the settings of the run.
         run: The run, with or without shots.
 
@@ -54,7 +53,6 @@ class LiveFit:
         """The newest finished fits, for JSON. If the points have changed, a new fit is started.
 
         Args:
-            scan: The points so far.
             means: The quantity at each point.
 
         Returns:
@@ -107,9 +105,6 @@ def _fit(
     """A fit for JSON.
 
     Args:
-        at: The fit.
-        scan: The points of the scan.
-        means: The quantity at each point.
         name: The parameter to report.
         shown: The unit in which its values at all ``at`` are easy to read, and its factor to SI.
     """

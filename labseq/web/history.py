@@ -44,7 +44,6 @@ class RunHistory:
     All methods may be called from several threads.
 
     Args:
-        run_dir: The run's folder.
         follower: Reads lines that are added to the index.
         series_of: Makes the series of the quantities that the page of the run shows.
     """

@@ -92,7 +92,6 @@ class Live:
     """The states of the runs that browsers watch.
 
     Args:
-        catalogue: The runs.
         limits: When alarms are raised.
     """
 

@@ -57,11 +57,7 @@ class NoSuchRun(LookupError):  # noqa: N818 - a missing page is not a failure
 
 
 class OpenRun:
-    """A run whose files are followed while it writes them.
-
-    Args:
-        folder: The run's folder.
-    """
+    """A run whose files are followed while it writes them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

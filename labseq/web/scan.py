@@ -31,7 +31,6 @@ class ScanView:
     """The scan of a run, for a page that shows some quantities. Its methods are called under the run's lock.
 
     Args:
-        run: The run.
         quantity: Name of the only quantity to show. "" for the quantities of the run's page.
 
     Raises:

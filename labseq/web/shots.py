@@ -31,7 +31,6 @@ def shot_values(shot: Shot, record_frames: str) -> dict[str, Any]:
     """A shot as JSON-ready values.
 
     Args:
-        shot: The shot.
         record_frames: Which frames the run keeps: "all", "last" or "none".
 
     Raises:

@@ -56,7 +56,6 @@ class RunState:
     """The state of a run, updated by :meth:`update`.
 
     Args:
-        run: The run.
         limits: When an alarm is raised.
     """
 
