@@ -49,7 +49,7 @@ def test_a_planner_takes_the_size_of_a_grid():
 
 
 def test_half_of_a_character_is_no_setting():
-    with pytest.raises(ConfigError, match=r"there is half a character in '#\\ud800'"):
+    with pytest.raises(ConfigError, match=r"'#\\ud800' contains half a character"):
         labseq.make_target("bitmap", sites="#\ud800")
 
 

@@ -1,1 +1,1 @@
-"""Reads YAML files into frozen, validated settings; errors name file, line and column."""
+"""Reads YAML files into frozen, validated settings. Errors name the file, line and column."""

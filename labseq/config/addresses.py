@@ -27,7 +27,7 @@ class Override(NamedTuple):
     Attributes:
         address: For example "planner.degree_of_parallelism".
         value: As typed, YAML.
-        origin: The option, for messages; "" means ``--set address=value``.
+        origin: The option, for messages. "" means ``--set address=value``.
     """
 
     address: str
@@ -42,16 +42,15 @@ class Override(NamedTuple):
 
 
 def split_overrides(options: Sequence[str]) -> tuple[list[Override], list[Override]]:
-    """Read the values of ``--set``, and separate those of the sequence from those of the profile.
+    """Read the values of ``--set``, split into settings of the sequence and of the profile.
 
-    ``profile=lab`` chooses the sequence's profile; ``profile.camera.gain=5``
-    sets a value in it.
+    ``profile=lab`` chooses the sequence's profile. ``profile.camera.gain=5`` sets a value in it.
 
     Returns:
-        Those of the sequence, and those of the profile without "profile.".
+        The overrides of the sequence, and the overrides of the profile without "profile.".
 
     Raises:
-        ConfigError: Not of the form ``address=value``.
+        ConfigError: A value is not of the form ``address=value``.
 
     Example:
         >>> split_overrides(["shots=5", "profile.grid.rows=10"])[1][0].address
@@ -68,7 +67,7 @@ def split_overrides(options: Sequence[str]) -> tuple[list[Override], list[Overri
         address = address.strip()
         origin = f"--set {option}"
         if not equals or not all(part.strip() == part != "" for part in address.split(".")):
-            what = "this is not of the form address=value"
+            what = "this does not have the form address=value"
             example = "for example --set planner.degree_of_parallelism=5"
             problems.append(Problem(what, clean(origin), expected=example))
         elif address.startswith(PROFILE):
@@ -84,14 +83,14 @@ def profile_overrides(options: Sequence[str]) -> list[Override]:
     """Read the values of ``--set`` of a command that uses a profile but no sequence.
 
     Returns:
-        Those of the profile, without "profile.".
+        The overrides, without "profile.".
 
     Raises:
-        ConfigError: Not of the form ``profile.address=value``.
+        ConfigError: A value is not of the form ``profile.address=value``.
     """
     others, profile = split_overrides(options)
     if others:
-        what = "there is no sequence here whose values could be changed"
+        what = "this command uses no sequence, only a profile"
         hint = "write --set profile.{}=..."
         raise ConfigError(
             [
@@ -108,16 +107,16 @@ def profile_overrides(options: Sequence[str]) -> list[Override]:
 
 
 def find(root: Node, address: str, source: str = "", may_add: Collection[str] | None = None) -> Loc:
-    """Convert an address to a location in a file; the last key of a mapping need not exist yet.
+    """Convert an address to a location in a file. The last key of a mapping need not exist yet.
 
-    With ``may_add``, missing mappings are created, too: at the top of the file only those that it lists,
-    below it anywhere but in ``devices``: "faults" of ``camera.faults.transient``.
+    With ``may_add``, missing mappings may be created too. At the top of the file these are only the listed
+    keys. Further down they can be anywhere except in ``devices``: "faults" of ``camera.faults.transient``.
 
     A list item with a ``name`` is addressed by it, and the address continues in its
     settings: ``shot.sort.window`` for ``shot.2.rearrange.window``.
 
     Args:
-        source: The option that has the address, for messages; "" for none.
+        source: The option with the address, for messages. "" for none.
 
     Raises:
         ConfigError: A part of the address does not exist.
@@ -133,7 +132,7 @@ def find(root: Node, address: str, source: str = "", may_add: Collection[str] | 
             continue
         keys = _keys_of_part(node, part)
         child = node.at(keys) if keys else None
-        # a name in `devices` is one that the file gives: another one is a typing error
+        # names in `devices` come from the file, so any other name is a typing error
         new = i == len(parts) - 1 or (
             may_add is not None and (part in may_add if i == 0 else here not in NAMED)
         )
@@ -145,7 +144,7 @@ def find(root: Node, address: str, source: str = "", may_add: Collection[str] | 
 
 
 def _keys_of_part(node: Node, part: str) -> Loc:
-    """The keys and indices of one part of an address; () if it does not exist."""
+    """The keys and indices of one part of an address, or () if it does not exist."""
     if isinstance(node.value, dict):
         return (part,) if part in node.value else ()
     if not isinstance(node.value, list):
@@ -154,7 +153,7 @@ def _keys_of_part(node: Node, part: str) -> Loc:
         return (int(part),) if len(part) < 6 and int(part) < len(node.value) else ()
     for i, item in enumerate(node.value):
         if _item_name(item) == part and isinstance(item.value, dict):
-            # a step is a mapping of its kind and its name; the rest of the address is in the kind's settings
+            # a step maps its kind to settings, in which the rest of the address is
             kinds = [key for key in item.value if key != "name"]
             return (i, kinds[0]) if len(kinds) == 1 else (i,)
     return ()

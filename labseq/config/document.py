@@ -24,7 +24,7 @@ _KINDS: Final[Mapping[FileKind, str]] = {"sequence": "shot", "hardware profile":
 
 
 class StoredText(NamedTuple):
-    """The text that a file had when a run began; paths in it stay relative to the file.
+    """The text of a file when a run began. Paths in it stay relative to the file.
 
     Attributes:
         text: The text.
@@ -75,8 +75,8 @@ class Document:
         path: The file.
         text: The file's text, without a byte order mark.
         root: The top mapping, with the results of the expressions once they are computed.
-        expressions: The expressions; None before :meth:`evaluated`.
-        replaced: Locations of wrong values that fallbacks replaced, so that the rest could be checked.
+        expressions: The expressions. None before :meth:`evaluated`.
+        replaced: Locations of wrong values that fallbacks replaced so that the rest could be checked.
     """
 
     path: Path
@@ -90,17 +90,17 @@ class Document:
         """Read a file.
 
         Args:
-            kept: The text to use in place of the file's, which need not exist then.
+            kept: The text to use instead of reading the file, which then need not exist.
 
         Raises:
-            ConfigError: It cannot be read, or is not strict YAML 1.2 with a mapping at the top.
+            ConfigError: The file cannot be read, or is not strict YAML 1.2 with a mapping at the top.
         """
         text, name = (read_bytes(path), str(path)) if kept is None else kept
         return replace(cls.parse(text, visible(name)), path=path)
 
     @classmethod
     def parse(cls, text: str | bytes, name: str) -> Document:
-        """Parse the content of a file; ``name`` is its name in messages.
+        """Parse the content of a file, called ``name`` in messages.
 
         Raises:
             ConfigError: It is not strict YAML 1.2 with a mapping at the top.
@@ -111,7 +111,7 @@ class Document:
         if root is None or root.value is None:
             raise ConfigError(Problem("the file is empty", name, expected=expected))
         if not isinstance(root.value, dict):
-            what = f"the file holds {shown(root.plain(), root.raw)} at its top"
+            what = f"the top level of the file is {shown(root.plain(), root.raw)}"
             raise root.mark.error(what, expected)
         return cls(Path(name), decoded, root)
 
@@ -134,7 +134,7 @@ class Document:
         """A copy with the results of its expressions.
 
         Raises:
-            ConfigError: All errors in them.
+            ConfigError: All errors in the expressions.
         """
         written = self.written
         texts = (node.value for _, node in written.leaves() if isinstance(node.value, str))
@@ -153,19 +153,19 @@ class Document:
     def locate(self, loc: Loc, key: bool = False) -> tuple[int, int]:
         """Line and column, counted from 1, of the value at a location, or of its key.
 
-        If it does not exist, those of its nearest parent; line 0 for the value of an option.
+        A missing value has the line and column of its nearest parent. The value of an option has line 0.
         """
         mark = self.root.mark_at(loc, key)
         return mark.line, mark.column
 
     def problem(self, loc: Loc, what: str, expected: str = "", hint: str = "", key: bool = False) -> Problem:
-        """Create a problem at a location: in the file, or in the option that set the value."""
+        """Create a problem at a location in the file, or in the option that set the value."""
         return self.root.mark_at(loc, key).problem(what, expected, hint)
 
     def error(
         self, loc: Loc, what: str, expected: str = "", hint: str = "", key: bool = False
     ) -> ConfigError:
-        """Create an error for a problem at a location; see :meth:`problem`."""
+        """Create an error for a problem at a location, as :meth:`problem` does."""
         return ConfigError(self.problem(loc, what, expected, hint, key))
 
     def with_values(self, values: Iterable[tuple[Loc, Node, Mark | None]]) -> Document:
@@ -186,8 +186,8 @@ class Document:
         Args:
             address: Keys, list indices and names of list items: "shot.2.rearrange.window"
                 or "shot.sort.window".
-            value: YAML for one value: ``5``, ``45 ms``, ``[60 ms, 40 ms]``, ``{use: psca}``.
-            origin: The option, which messages name as the place of errors in the value.
+            value: YAML for one value, for example ``5``, ``45 ms``, ``[60 ms, 40 ms]``, ``{use: psca}``.
+            origin: The option, which messages give as the place of errors in the value.
             may_add: Addresses of mappings that are added if the file has none.
 
         Raises:
@@ -220,10 +220,10 @@ class Document:
         *,
         may_add: Collection[str] = (),
     ) -> Document:
-        """A copy with several values replaced, in order; see :meth:`override`.
+        """A copy with several values replaced, in order (see :meth:`override`).
 
         Args:
-            problems: Receives those of overrides that cannot be applied.
+            problems: Receives the problems of overrides that cannot be applied.
             may_add: Addresses of mappings that are added if the file has none.
         """
         document = self
@@ -242,12 +242,12 @@ class Document:
         core_keys: Collection[str] = (),
         called: str = "",
     ) -> M:
-        """Validate the mapping at a location against a settings model; an empty or missing one counts as {}.
+        """Validate the mapping at a location with a settings model. An empty or missing mapping counts as {}.
 
         Args:
             loc: Location of the mapping.
             core_keys: Keys that belong to another model and are left out.
-            called: Name of the mapping in messages: "camera 'andor'"; "" for its key.
+            called: Name of the mapping in messages, for example "camera 'andor'". "" for its key.
 
         Raises:
             ConfigError: All errors in the mapping, in file order.
@@ -259,14 +259,14 @@ class Document:
 
 
 def check_kind(document: Document, kind: FileKind) -> None:
-    """Raise for a file of another kind or of a newer format, before any other check.
+    """Raise for a file of the wrong kind or of a newer format, before any other check.
 
     Raises:
-        ConfigError: It is for a newer labseq, or it is not a sequence or a profile.
+        ConfigError: The file is for a newer labseq, or it is not of this kind.
     """
     version, keys = document.get(("labseq",)), cast("dict[str, Node]", document.root.value)
     if isinstance(version, int) and version > FORMAT:
-        what = f"this file is written for a newer labseq: its format is {version}, this labseq reads {FORMAT}"
+        what = f"this file is for a newer labseq (its format is {version}, this labseq reads {FORMAT})"
         raise document.error(("labseq",), what, "", "update labseq")
     for other, key in _KINDS.items():
         if other != kind and key in keys and _KINDS[kind] not in keys:
@@ -277,11 +277,11 @@ def check_kind(document: Document, kind: FileKind) -> None:
 def plugin_paths(document: Document, folders: Sequence[str]) -> list[Path]:
     """The folders of ``plugin_folders``, relative to the file that names them.
 
-    Every file that ``labseq new`` makes names ``plugins``; a file that uses no plugin of it can be copied
-    without it.
+    Only ``plugins`` may be missing. Every file made by ``labseq new`` names this folder, and a file that uses
+    no plugin from it can be copied without it.
 
     Raises:
-        ConfigError: Another one does not exist.
+        ConfigError: Another folder does not exist.
     """
     paths = [path_beside(document.path.parent, folder) for folder in folders]
     problems = [
@@ -303,8 +303,8 @@ class FallbackValues:
     """Valid values that replace invalid ones, so that the rest of a file can still be checked.
 
     Attributes:
-        values: Every required key -> a value.
-        items: Key of a list or mapping -> an item of it.
+        values: Every required key -> a valid value.
+        items: Key of a list or mapping -> a valid item.
     """
 
     values: Mapping[str, Any]
@@ -319,7 +319,7 @@ def load_checked(
     Args:
         model: The settings model of the whole file.
         fallbacks: Values that replace invalid ones.
-        problems: Receives those of the file.
+        problems: Receives the problems of the file.
 
     Raises:
         ConfigError: The file has errors, and its other values cannot be checked.
@@ -328,7 +328,7 @@ def load_checked(
         return document, document.validate(model, called=called)
     except ConfigError as error:
         repaired = _without_wrong_values(document, model, fallbacks)
-        # Without these two, plugins would count as unknown, and the target would not match the grid.
+        # With fallbacks for these two, plugins would be unknown and the target would not match the grid.
         if any(repaired.get((key,)) != document.get((key,)) for key in ("plugin_folders", "profile")):
             raise
         spec = repaired.validate(model, called=called)
@@ -339,7 +339,7 @@ def load_checked(
 def _without_wrong_values(document: Document, model: SettingsType, fallbacks: FallbackValues) -> Document:
     """A copy whose invalid values are replaced by fallbacks, or removed if there is no fallback."""
     root, seen, replaced = document.root, set[Loc](), set[Loc]()
-    for _ in range(5):  # validators of a whole list run once all its items are right
+    for _ in range(5):  # validators of a whole list run only once all its items are right
         findings = check(model, root, ValidationContext("", needs_units=True))
         if not isinstance(findings, list):
             break

@@ -1,8 +1,8 @@
 """Expressions in files: ``window: = variables.hold + 5 ms``.
 
-A scalar that begins with "=" is an expression; "==" is text that begins with "=". Numbers, quantities
-and addresses are cut out and replaced by a name of one letter. Python's ``ast`` parses the rest, in
-which a few kinds of node are allowed: operators, brackets and calls of the functions listed here.
+A scalar that begins with "=" is an expression. To write text that begins with "=", begin it with "==".
+Numbers, quantities and addresses are cut out and replaced by a name of one letter. Python's ``ast`` parses
+the rest, which may only contain operators, brackets and calls of the functions listed here.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ MAX_LENGTH: Final = 500
 MAX_PARTS: Final = 200
 """Maximum number of values, operators and functions in an expression."""
 MAX_PROBLEMS: Final = 60
-"""Wrong expressions that are looked at; not all of them are shown."""
+"""Maximum number of wrong expressions that are examined. Not all of them are shown."""
 _MAX_POWER: Final = 12
 _MAX_EXPONENT: Final = 1000
 _EXACT: Final = 2**53  # from here on, whole numbers are kept as floats
@@ -58,8 +58,8 @@ class ExpressionError(ValueError):
     """An error in an expression.
 
     Attributes:
-        at: Index of the character; None until it is known.
-        problem: The error, what was expected and what to do.
+        at: Index of the character. None until it is known.
+        problem: The error, the expected value and the remedy.
     """
 
     def __init__(self, what: str, expected: str = "", hint: str = "", at: int | None = None) -> None:
@@ -68,14 +68,14 @@ class ExpressionError(ValueError):
 
 
 class Quantity(NamedTuple):
-    """A number in SI, and the exponents of its units."""
+    """A number in SI units, and the exponents of the units."""
 
     amount: Number
     powers: Powers = NONE
 
     @property
     def unit(self) -> str:
-        """Its SI unit; "" for a number."""
+        """Its SI unit, or "" for a plain number."""
         dimension = _DIMENSIONS.get(self.powers, "")
         if dimension == "number":
             return ""
@@ -95,7 +95,7 @@ def _checked(amount: Number, powers: Powers) -> Quantity:
     if isinstance(amount, int) and abs(amount) >= _EXACT:
         amount = float(amount)
     if not math.isfinite(amount):
-        raise ExpressionError("this is too large a number")
+        raise ExpressionError("this number is too large")
     if any(abs(power) > _MAX_POWER for power in powers):
         raise ExpressionError(f"powers of units go up to {_MAX_POWER}")
     return Quantity(amount, powers)
@@ -136,12 +136,12 @@ def _power(x: Quantity, y: Quantity) -> Quantity:
         expected = f"a number from -{_MAX_EXPONENT} to {_MAX_EXPONENT}"
         raise ExpressionError(f"the exponent is {came}", expected)
     if x.powers != NONE and not isinstance(y.amount, int):
-        raise ExpressionError(f"{x.kind} has whole powers only", "a whole number as exponent")
+        raise ExpressionError(f"{x.kind} can only be raised to a whole power", "a whole number as exponent")
     if x.amount == 0 and y.amount < 0:
         raise ExpressionError("this divides by zero")
     if x.amount < 0 and y.amount != int(y.amount):
-        raise ExpressionError("a negative number has no such power")
-    amount: Number = float(x.amount) ** y.amount  # as floats first: they cannot grow without end
+        raise ExpressionError("a negative number can only be raised to a whole power")
+    amount: Number = float(x.amount) ** y.amount  # as floats first, because integers could grow without limit
     if isinstance(x.amount, int) and isinstance(y.amount, int) and y.amount >= 0 and abs(amount) < _EXACT:
         amount = x.amount**y.amount
     return _checked(amount, tuple(power * int(y.amount) for power in x.powers))
@@ -182,7 +182,7 @@ def _call(name: str, values: list[Quantity]) -> Quantity:
         return Quantity(abs(x.amount), x.powers)
     if name == "sqrt":
         if any(power % 2 for power in x.powers):
-            raise ExpressionError(f"sqrt() of {x.kind} has no unit")
+            raise ExpressionError(f"the square root of {x.kind} has no valid unit")
         return _checked(math.sqrt(x.amount), tuple(power // 2 for power in x.powers))
     takes_angle = name in ("sin", "cos", "tan")
     if x.powers != NONE and not (takes_angle and x.powers == POWERS["angle"]):
@@ -192,7 +192,7 @@ def _call(name: str, values: list[Quantity]) -> Quantity:
 
 _UNITS: Final = "|".join(
     re.escape(unit)
-    # the longest first: "um/ms" is one unit, not "um" divided by something
+    # the longest first, because "um/ms" is one unit, not "um" divided by something
     for unit in sorted({*(unit for units in UNITS.values() for unit in units), "degC"}, key=len)[::-1]
     if unit not in ("", "%")
 )
@@ -224,7 +224,7 @@ def _parse(text: str) -> _Parsed:
     """Parse an expression with its "=".
 
     Raises:
-        ExpressionError: The text is not an expression, or too long.
+        ExpressionError: The text is not an expression, or is too long.
     """
     if len(text) > MAX_LENGTH:
         raise ExpressionError(f"the expression has {len(text)} characters", f"at most {MAX_LENGTH}", at=0)
@@ -236,7 +236,7 @@ def _parse(text: str) -> _Parsed:
             raise _unexpected(text, at)
         if token["number"] or token["name"]:
             values[at - shift] = token["name"] or _literal(token, at)
-            # as long as before, so that a place in the tree is a place in the expression
+            # keep the length, so that places in the tree are places in the expression
             replaced += "x".ljust(len(token[0]))
         else:
             replaced += token[0] if token[0].strip() else " " * len(token[0])
@@ -259,7 +259,7 @@ def _literal(token: re.Match[str], at: int) -> Quantity:
     number, unit = token["number"], token["unit"] or ""
     amount: Number = float(number)
     if not math.isfinite(amount):
-        raise ExpressionError("this is too large a number", at=at)
+        raise ExpressionError("this number is too large", at=at)
     if unit == "degC":
         return Quantity(amount + ZERO_CELSIUS_K, POWERS["temperature"])
     if unit:
@@ -294,7 +294,7 @@ class _Evaluation:
         """The value of a part.
 
         Raises:
-            ExpressionError: It has no value; with the place.
+            ExpressionError: The part has no value. The error includes the place.
         """
         at = node.col_offset
         try:
@@ -316,12 +316,12 @@ class _Evaluation:
                 case _:
                     raise _unexpected(self.text, at + self.parsed.shift)
         except OverflowError:
-            raise ExpressionError("this is too large a number", at=at + self.parsed.shift) from None
+            raise ExpressionError("this number is too large", at=at + self.parsed.shift) from None
         except ExpressionError as error:
             error.at = at + self.parsed.shift if error.at is None else error.at
             raise
         except ValueError:
-            raise ExpressionError("this function has no value there", at=at + self.parsed.shift) from None
+            raise ExpressionError("this function has no value here", at=at + self.parsed.shift) from None
 
     def _operator(self, left: ast.expr, right: ast.expr) -> int:
         """Index of the operator between two parts, outside of their brackets."""
@@ -338,7 +338,7 @@ class _Evaluation:
         raise ExpressionError(what, listing(FUNCTIONS), hint)
 
 
-_KNOWN: Final = "an expression can use values of its own file, not defaults"
+_KNOWN: Final = "an expression can only use values that are written in its own file, not defaults"
 
 
 def is_expression(node: Node) -> bool:
@@ -354,7 +354,8 @@ def evaluate(root: Node, text: str) -> tuple[Node, dict[Loc, str], dict[Loc, fro
         text: Its text, for places within expressions.
 
     Returns:
-        The file with their values, the text of each, and the places of all values that each depends on.
+        The file with the values of its expressions, the text of each expression, and the places of all values
+        that each expression depends on.
 
     Raises:
         ConfigError: All errors in them.
@@ -365,7 +366,7 @@ def evaluate(root: Node, text: str) -> tuple[Node, dict[Loc, str], dict[Loc, fro
         if is_expression(node) and loc[0] != "scan":
             evaluator.nodes[loc] = node
         elif is_expression(node):
-            hint = "scan a variable, and let others follow from it"
+            hint = "scan a variable, and compute other values from it"
             evaluator.report(node, ExpressionError("an expression is not allowed in a scan", "a value", hint))
         elif isinstance(node.value, str) and node.value.startswith("==") and loc[:1] != ("scan",):
             text_node = replace(node, value=node.value[1:], raw=node.raw[1:])
@@ -383,7 +384,7 @@ def evaluate(root: Node, text: str) -> tuple[Node, dict[Loc, str], dict[Loc, fro
 
 @dataclass(slots=True)
 class _Evaluator:
-    """Computes the expressions of a file, each after those that it refers to."""
+    """Computes the expressions of a file, in the order of their references."""
 
     root: Node
     lines: list[str]
@@ -411,7 +412,7 @@ class _Evaluator:
             sorter.prepare()
         except CycleError as error:
             self._report_cycle(error.args[1][::-1], references)
-        # after a circle, too: what it does not block is still computed, to report its errors
+        # after a circular reference too, to report errors in the expressions that it does not block
         while ready := sorter.get_ready():
             for loc in ready:
                 if loc in references:
@@ -477,7 +478,7 @@ class _Evaluator:
         return Quantity(amount, POWERS[dimension])
 
     def _report_cycle(self, ring: list[Loc], references: Mapping[Loc, Mapping[str, Loc]]) -> None:
-        # a circle has no beginning: the message starts with the expression that comes first in the file
+        # the message starts with the expression of the circle that comes first in the file
         start = ring.index(next(loc for loc in self.nodes if loc in ring))
         ring = [*ring[start:-1], *ring[: start + 1]]
         way = " -> ".join(".".join(map(str, loc)) for loc in ring)
@@ -489,7 +490,7 @@ class _Evaluator:
         )
 
     def report(self, node: Node, error: ExpressionError) -> None:
-        """Record a problem; its column is that of the character if the text is on a line of the file."""
+        """Record a problem. Its column points to the character if the text is on a line of the file."""
         mark, text, at, problem = node.mark, str(node.value), error.at or 0, error.problem
         what = problem.what
         line = self.lines[mark.line - 1][mark.column - 1 :] if 0 < mark.line <= len(self.lines) else ""

@@ -1,4 +1,4 @@
-"""Finds hardware profiles and sequences by name, including those that come with labseq."""
+"""Finds hardware profiles and sequences by name, including the packaged ones."""
 
 from __future__ import annotations
 
@@ -37,15 +37,14 @@ def find_profile(name_or_path: str | Path, beside: Path, *, named_in: Document |
     """Find a hardware profile.
 
     Args:
-        name_or_path: A name, searched in ``beside``, in ./hardware_profiles and
-            among the packaged profiles; text with a path separator or with the
-            ending .yaml or .yml is a path, relative to ``beside``; a ``Path`` is
-            relative to the working directory.
+        name_or_path: A name is searched in ``beside``, in ./hardware_profiles and among the packaged
+            profiles. Text with a path separator or with the ending .yaml or .yml is a path, relative to
+            ``beside``. A ``Path`` is relative to the working directory.
         beside: Folder of the file that names the profile.
         named_in: The sequence whose key ``profile`` names it, for messages.
 
     Raises:
-        ConfigError: There is no such profile; names the searched folders and the known profiles.
+        ConfigError: There is no such profile. The message names the searched folders and the known profiles.
     """
     if isinstance(name_or_path, Path):
         return name_or_path
@@ -75,19 +74,20 @@ def find_sequence(given: Path) -> Path:
     """Find a sequence.
 
     Args:
-        given: A path, relative to the working directory; or a name, without a path separator and without
-            the ending .yaml or .yml: it is searched in the working directory, in ./sequences and
-            among the packaged sequences.
+        given: A path, relative to the working directory, or a name without a path separator and without the
+            ending .yaml or .yml. A name is searched in the working directory, in ./sequences and among the
+            packaged sequences.
 
     Raises:
-        ConfigError: There is no sequence of this name; names the searched folders and the known sequences.
+        ConfigError: There is no such sequence. The message names the searched folders and the known
+            sequences.
     """
     name = str(given)
     if is_path(name) or given.suffix:
         packaged = packaged_sequences_dir() / given.name
         if is_file(packaged) and not is_file(given) and not something_else(given):
             copied = "or copy it with 'labseq demo --copy .'"
-            hint = f"use '{packaged.stem}' for the one that comes with labseq, {copied}"
+            hint = f"use '{packaged.stem}' for labseq's own sequence, {copied}"
             raise ConfigError(Problem("there is no such file", visible(name), hint=hint))
         return given
     folders = (Path(), Path(SEQUENCES), packaged_sequences_dir())

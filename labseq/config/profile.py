@@ -51,8 +51,8 @@ class DeviceChoice(Choice):
 
     role: Literal["device", "camera"] = Field(
         default="device",
-        description="kind of plugin: `camera` for a further camera, such as one that "
-        "looks at the light of the tweezers",
+        description="kind of plugin: `camera` for a further camera, such as "
+        "a camera for the light of the tweezers",
     )
     blinding: Blinding | None = Field(
         default=None,
@@ -63,38 +63,38 @@ class DeviceChoice(Choice):
     def _check_blinding(self) -> Self:
         if self.role == "camera" and self.blinding is not None:
             raise setting_error(
-                "`blinding` is set for a camera", "it for `role: device` only", at=("blinding",), key=True
+                "`blinding` is set for a camera", "`role: device` with it", at=("blinding",), key=True
             )
         return self
 
 
 class PowerMeterSettings(Settings):
-    """What measures the powers of tweezers for `labseq calibrate tweezers` and `amplitudes`."""
+    """The power meter of the tweezers for `labseq calibrate tweezers` and `amplitudes`."""
 
     device: Text = Field(
         default="trap_camera",
-        description="device of the profile that measures the power of each tweezer: one with `role: camera`, "
-        "or another meter; `camera`: the camera of the atoms",
+        description="device of the profile that measures the power of each tweezer: a camera with "
+        "`role: camera`, another meter, or `camera` for the camera of the atoms",
     )
     value: Text = Field(
         default="spot_powers",
-        description="what to read of a device other than a camera: an array of rows and columns, or one "
-        "number for the light of all tweezers; each tone is then measured alone",
+        description="reading of a device other than a camera: an array of rows and columns, or one "
+        "number for the light of all tweezers. With one number each tone is measured alone",
     )
     exposure: PositiveDuration = Field(
-        default=1e-3, description="exposure time of a camera; its brightest pixels must not be saturated"
+        default=1e-3, description="exposure time of a camera. Its brightest pixels must not be saturated"
     )
     settle: Duration = Field(
         default=0.0,
-        description="how long to wait after a change of the tones, until the meter shows it",
+        description="time that the meter needs to show a change of the tones",
     )
     mobile_exposure: PositiveDuration = Field(
         default=0.1e-3, description="exposure time of a camera for the mobile tweezers, which are brighter"
     )
     lead: Duration = Field(
         default=5e-3,
-        description="how long the mobile tweezers are on before and after an exposure; longer than the delay "
-        "of a camera",
+        description="how long the mobile tweezers are on before and after an exposure. It must be longer "
+        "than the delay of a camera",
     )
 
 
@@ -117,7 +117,7 @@ def check_devices(devices: dict[str, DeviceChoice]) -> dict[str, DeviceChoice]:
 
 
 OFF: Final = "off"
-"""Value in place of an id or a folder that means no calibration."""
+"""Value instead of an id or a folder that means no calibration."""
 
 
 class CalibrationChoices(Settings):
@@ -149,15 +149,15 @@ class CalibrationChoices(Settings):
 
 
 class CalibrationSettings(Settings):
-    """Where the profile's calibrations are stored, and which of them are used.
+    """Where the profile's calibrations are stored, and which calibrations are used.
 
     The mapping may be replaced by a folder alone, or by `off` for no calibrations.
     """
 
     folder: FilePath | None = Field(
         default=None,
-        description="folder of the calibrations, relative to this file; without it `calibrations/NAME` "
-        "beside a file `NAME.yaml`, and in `./hardware_profiles` for a profile that comes with labseq",
+        description="folder of the calibrations, relative to this file. By default `calibrations/NAME` next "
+        "to a file `NAME.yaml`, and in `./hardware_profiles` for a profile that comes with labseq",
     )
     use: Annotated[CalibrationChoices, empty_is({})] = Field(
         default=CalibrationChoices(),
@@ -180,7 +180,7 @@ def _distinct(channels: dict[str, LineSpec]) -> dict[str, LineSpec]:
     for (first, a), (second, b) in combinations(channels.items(), 2):
         if a.triggers and a.triggers == b.triggers:
             what = f"'{first}' and '{second}' both trigger the {a.triggers.replace('_', ' ')}"
-            raise setting_error(what, "one line for that", at=(second, "triggers"))
+            raise setting_error(what, "one line that triggers it", at=(second, "triggers"))
     for name in channels:
         check_name(name, "a line")
     return channels
@@ -207,10 +207,8 @@ class LinesChoice(Choice):
                     )
             first, second = (self.channels[name] for name in pair)
             if both := sorted(set(first.on) & set(second.on)):
-                what = (
-                    f"'{pair[0]}' and '{pair[1]}' must never be on together, but both are during '{both[0]}'"
-                )
-                raise setting_error(what, "one of them off then", at=("channels", pair[1], "on"))
+                what = f"'{pair[0]}' and '{pair[1]}' must never be on together, but are during '{both[0]}'"
+                raise setting_error(what, "one of them off", at=("channels", pair[1], "on"))
         return self
 
     def specs(self) -> tuple[LineSpec, ...]:
@@ -291,34 +289,34 @@ class AlarmSettings(Settings):
 
     saturated: Fraction = Field(
         default=0.05,
-        description="largest share of a frame's pixels that have its highest value; 100 %: no alarm",
+        description="largest share of a frame's pixels at its highest value. 100 % turns the alarm off",
     )
-    frozen: bool = Field(default=True, description="whether two equal frames after one another are an alarm")
+    frozen: bool = Field(default=True, description="whether two identical frames in a row are an alarm")
     atoms: Fraction = Field(
         default=0.02,
         description="least share of the sites with an atom on the first image, over as many shots as have "
-        "100 sites together; 0: no alarm",
+        "100 sites together. 0 turns the alarm off",
     )
     full: int = Field(
         default=100,
         ge=0,
-        description="this many sites, all with an atom on the first image, of one shot or of several in a "
-        "row, are an alarm; 0: no alarm",
+        description="an alarm if this many sites, in one shot or several in a row, all have an atom on the "
+        "first image. 0 turns the alarm off",
     )
     loading: Fraction = Field(
         default=0.5,
         description="least number of loaded atoms, relative to the mean of the last 10 to 20 shots with the "
-        "same settings, where it is also 5 standard deviations below; 0: no alarm",
+        "same settings. The alarm also needs 5 standard deviations. 0 turns the alarm off",
     )
     confidence: Fraction = Field(
         default=0.99,
         description="least confidence of the detector, on average over the sites of an image, over as many "
-        "shots as have 1,000 sites together; 0: no alarm",
+        "shots as have 1,000 sites together. 0 turns the alarm off",
     )
     arrived: Fraction = Field(
         default=0.1,
-        description="least share of the atoms moved by the first cycle to empty sites that the next image "
-        "shows there, over as many shots as have 100 of them together; 0: no alarm",
+        description="least share of the atoms moved to empty sites by the first cycle that the next image "
+        "shows there, over as many shots as have 100 such atoms together. 0 turns the alarm off",
     )
     clock: Duration = Field(
         default=10.0, description="largest jump of the computer's clock between two shots"
@@ -326,12 +324,12 @@ class AlarmSettings(Settings):
     stop_after: int = Field(
         default=10,
         ge=0,
-        description="number of shots in a row with the same alarm after which the run is stopped; 0: never",
+        description="number of shots in a row with the same alarm that stops the run. 0 means never",
     )
 
 
 class ProfileSpec(Settings):
-    """A hardware profile; the settings of its plugins are checked later."""
+    """A hardware profile. The settings of its plugins are checked later."""
 
     labseq: FormatVersion = Field(description="version of the file format: 1")
     name: Name = Field(description="name of the machine")
@@ -355,7 +353,7 @@ class ProfileSpec(Settings):
     )
     equalise: Annotated[PowerMeterSettings, empty_is({})] = Field(
         default=PowerMeterSettings(),
-        description="what `labseq calibrate tweezers` and `amplitudes` measure with, in place of the "
+        description="power meter of `labseq calibrate tweezers` and `amplitudes`, instead of the "
         "defaults of the step `equalise`",
     )
     calibrations: Annotated[CalibrationSettings, empty_is({})] = Field(
@@ -383,7 +381,7 @@ class ProfileSpec(Settings):
 
     @property
     def choices(self) -> dict[str, Choice]:
-        """The plugins chosen in this file, by role; lines and simulation only if they are given."""
+        """The plugins chosen in this file, by role, with lines and simulation only if the file has them."""
         choices = {role: getattr(self, role) for role in PROFILE_ROLES}
         return {role: choice for role, choice in choices.items() if choice is not None}
 
@@ -442,7 +440,7 @@ def load_profile(
     """Find and read a hardware profile.
 
     Args:
-        name_or_path: See :func:`find_profile`: beside ``named_in``, else in the working folder.
+        name_or_path: As for :func:`find_profile`, next to ``named_in`` or else in the working folder.
         overrides: Values that replace those in the file, addresses without "profile.".
         named_in: The sequence whose key ``profile`` names it.
 

@@ -1,7 +1,7 @@
 """Scans in a sequence: lists of values, ranges, and adaptive scans, whose points a scanner chooses.
 
-Only the form of a scan is checked here. Whether plugins accept the values is checked where the plugins
-are known, in ``labseq.assembly.points``; the scanner and its quantity in ``labseq.assembly.search``.
+Only the form of a scan is checked here. ``labseq.assembly.points`` checks whether plugins accept the values,
+and ``labseq.assembly.search`` checks the scanner and its quantity.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Axis:
     Attributes:
         address: As written: "planner.degree_of_parallelism", "profile.mobile_tweezers.speed".
         loc: Location of its value in the sequence or the profile.
-        values: Its values, one per position of its group.
+        values: The values, one per position of the group.
         key: Place of the address in the file.
     """
 
@@ -52,15 +52,15 @@ class Axis:
 
 
 Group = tuple[Axis, ...]
-"""Axes that change together: all have the same number of values."""
+"""Axes that change together and so have the same number of values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """The points of a scan: the outer product of its groups, of which the first changes most slowly.
+    """The points of a scan: the outer product of its groups. The first group changes most slowly.
 
     Attributes:
-        groups: The groups, in the order written; without any there is one point.
+        groups: The groups, in the order written. Without groups there is one point.
         repeats: Number of shots at each point.
         order: "sequential" or "shuffled".
         notes: Warnings, for example that ``--set`` replaced an axis.
@@ -82,7 +82,7 @@ class Scan:
         return math.prod(self.shape)
 
     def allows(self, n_shots: int, *, as_option: bool) -> bool:
-        """Whether a run may have this number of shots; an option may ask for part of a scan, or for more."""
+        """Whether a run may have this number of shots. An option may ask for part of a scan, or for more."""
         return as_option or n_shots == self.n_points * self.repeats
 
     @property
@@ -91,7 +91,7 @@ class Scan:
         return tuple(axis for group in self.groups for axis in group)
 
     def values(self, number: int) -> Iterator[tuple[Axis, Node]]:
-        """Each axis with its value at the point of a number."""
+        """Each axis with its value at a point, given by its number."""
         positions = np.unravel_index(number, self.shape) if self.groups else ()
         for group, position in zip(self.groups, positions, strict=True):
             for axis in group:
@@ -100,16 +100,17 @@ class Scan:
     def points_of_shots(self, seed: int, n_shots: int) -> NDArray[np.int32]:
         """Number of the point of each shot, int32 (n_shots,).
 
-        Shots beyond n_points * repeats begin the scan again, so that a run can be given more of them.
-        Sequential: all shots of a point, then the next. Shuffled: round by round; each round
-        takes every point once, in an order drawn from the run's seed, so that a drift of the
-        machine affects all points equally, even in a run that is stopped early.
+        Shots beyond n_points * repeats begin the scan again, so that a run can have more shots.
+
+        A sequential scan takes all shots of a point before the next point. A shuffled scan takes every point
+        once per round, in an order drawn from the run's seed. A drift of the machine then affects all points
+        equally, even in a run that is stopped early.
         """
         points = np.arange(self.n_points, dtype=np.int32)
         if self.order == "sequential":
             n_passes = -(-n_shots // (self.n_points * self.repeats))
             return np.tile(np.repeat(points, self.repeats), n_passes)[:n_shots]
-        # A key of one part: the random numbers of shots have keys of two parts.
+        # A key of one part, because the random numbers of shots have keys of two parts.
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x5CA4,)))
         n_rounds = -(-n_shots // self.n_points)
         return np.concatenate([rng.permutation(points) for _ in range(n_rounds)])[:n_shots]
@@ -118,7 +119,7 @@ class Scan:
         """A copy in which the axes of the profile have their locations in the profile.
 
         Raises:
-            ConfigError: Addresses that do not exist in it, or whose settings a scan cannot change.
+            ConfigError: An address does not exist in the profile, or a scan cannot change its setting.
         """
         problems, groups = ProblemCollector(), list[Group]()
         for group in self.groups:
@@ -147,7 +148,7 @@ class Scan:
 
         def with_address(problem: Problem) -> Problem:
             address = places.get((problem.source, problem.line, problem.column))
-            note = f"the scan puts it into '{clean(address or '')}'"
+            note = f"this value comes from the scan of '{clean(address or '')}'"
             if address is None or note in problem.notes:
                 return problem
             return replace(problem, notes=(*problem.notes, note))
@@ -170,7 +171,7 @@ def _marks(node: Node) -> Iterator[Mark]:
 
 
 End: TypeAlias = Annotated[Any, WithJsonSchema({"type": ["number", "string"]})]
-"""A number or quantity; which one depends on the address."""
+"""A number or a quantity, as the address requires."""
 Points: TypeAlias = Annotated[int, Field(ge=1, le=MAX_POINTS)]
 
 
@@ -180,7 +181,7 @@ class EndsSettings(Settings):
     low: End = Field(alias="from", description="least value")
     high: End = Field(alias="to", description="greatest value")
     steps: Points | None = Field(
-        default=None, description="number of equal steps between the values; without it any value is allowed"
+        default=None, description="number of equal steps in the range. Without it any value is allowed"
     )
 
 
@@ -220,12 +221,12 @@ class AdaptiveChoice(Choice):
 
 @dataclass(frozen=True, slots=True)
 class RangeAxis(Axis):
-    """An address whose values a scanner chooses; its two ``values`` are the ends of its range.
+    """An address whose values a scanner chooses. Its two ``values`` are the ends of its range.
 
     Attributes:
         low: The lowest value.
         high: The highest value, in the unit of the lowest.
-        n_steps: Number of equal steps; 0 if any value between the ends is allowed.
+        n_steps: Number of equal steps. 0 if any value between the ends is allowed.
         mark: Place of the range in the file.
     """
 
@@ -236,11 +237,11 @@ class RangeAxis(Axis):
 
     @property
     def unit(self) -> str:
-        """The unit that values are written in; "" for plain numbers."""
+        """The unit in which values are written. "" for plain numbers."""
         return self.low.unit
 
     def at(self, value: float) -> Axis:
-        """The axis at one value, SI, as a user would write it; without steps, rounded to a few digits."""
+        """The axis at one value, SI, as a user would write it, rounded to a few digits without steps."""
         if not isinstance(value, int) and not self.n_steps:
             low, high = self.low.amount, self.high.amount
             # A ten-thousandth of the range is finer than any setting needs.
@@ -256,7 +257,7 @@ class RangeAxis(Axis):
 class AdaptiveScan(Scan):
     """A scan whose points a scanner chooses during the run.
 
-    As a :class:`Scan`, its points are the corners of the ranges: the settings are validated there.
+    As a :class:`Scan`, its points are the corners of the ranges, at which the settings are validated.
 
     Attributes:
         choice: The scanner, and the quantity to optimise.
@@ -272,7 +273,7 @@ class AdaptiveScan(Scan):
         return self.max_points
 
     def allows(self, n_shots: int, *, as_option: bool) -> bool:
-        """The same; its scanner cannot begin again."""
+        """Whether a run may have this number of shots. A scanner cannot begin again for more."""
         n_most = self.n_points * self.repeats
         return n_shots == n_most or (as_option and n_shots < n_most)
 
@@ -287,7 +288,7 @@ class AdaptiveScan(Scan):
         return Scan(tuple((axis.at(value),) for axis, value in axes), self.repeats, self.order)
 
     def at_first_point(self, document: Document, *, profile: bool) -> Document:  # noqa: ARG002
-        """The document as it is: the first point is not known yet."""
+        """The document unchanged, because the first point is not known yet."""
         return document
 
 
@@ -302,11 +303,12 @@ def load_scan(
     Args:
         document: A sequence with a scan.
         overrides: Its overrides.
-        profile_set: Those of the profile, with their "profile.".
-        problems: Receives those of the scan.
+        profile_set: Overrides of the profile, with their "profile.".
+        problems: Receives the problems of the scan.
 
     Returns:
-        The copy, also with ``shots`` from the scan; and the scan. If it is invalid: a copy without it, None.
+        The copy, with ``shots`` from the scan, and the scan. For an invalid scan, a copy without it, and
+        None.
     """
     try:
         scan = read_scan(document, [*overrides, *profile_set])
@@ -320,7 +322,7 @@ def load_scan(
     elif type(shots) is int and not scan.allows(shots, as_option=is_option):
         what = f"shots is {shots}, but the scan has {scan.n_points} x {scan.repeats} = {n_shots}"
         expected = f"at most {n_shots}" if is_option else ""
-        hint = "write 'points' for more" if is_option else "leave 'shots' out, it follows from the scan"
+        hint = "set 'points' for more" if is_option else "remove 'shots', which follows from the scan"
         problems.add(document.error(("shots",), what + " (points x repeats)", expected, hint))
     return scan.at_first_point(document, profile=False), scan
 
@@ -335,11 +337,11 @@ def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan:
     """Read ``scan``, ``repeats`` and ``order`` of a sequence that has a scan.
 
     Args:
-        fixed: The overrides, those of the profile with their "profile."; an axis that one of
-            them sets is left out, since ``--set`` takes precedence.
+        fixed: The overrides, with "profile." for the profile. An axis that an override sets is left out,
+            since ``--set`` takes precedence.
 
     Returns:
-        The scan, its profile axes not yet bound.
+        The scan. Its axes in the profile have no locations yet.
 
     Raises:
         ConfigError: All errors in its form.
@@ -351,7 +353,7 @@ def read_scan(document: Document, fixed: Sequence[Override] = ()) -> Scan:
 
 
 def _repeats(document: Document) -> int:
-    """Number of shots at each point; 1 if it has an error, which the model of the file reports."""
+    """Number of shots at each point. 1 if it has an error, which the model of the file reports."""
     repeats = document.get(("repeats",), 1)
     return repeats if type(repeats) is int and repeats >= 1 else 1
 
@@ -389,15 +391,15 @@ _Written = Mapping[str, tuple[Mark, Node]]
 
 
 def _mappings(node: Node, problems: ProblemCollector) -> list[_Written]:
-    """In a mapping each address is a separate group; in a list each mapping is a group."""
+    """The groups: each address of a mapping, or each mapping of a list."""
     expected = "a mapping of addresses and their values, or a list of such mappings"
     items = node.value if isinstance(node.value, list) else [node]
     groups: list[_Written] = []
     if not items:
-        problems.add(node.mark.error("scan is empty", expected))
+        problems.add(node.mark.error("the scan is empty", expected))
     for item in items:
         if not isinstance(item.value, dict) or not item.value:
-            name = "scan" if item is node else "a group of the scan"
+            name = "the scan" if item is node else "a group of the scan"
             value = "empty" if item.value == {} else shown(item.plain(), item.raw)
             problems.add(item.mark.error(f"{name} is {value}", expected))
             continue
@@ -415,7 +417,7 @@ def _check_together(group: Sequence[Axis]) -> None:
             what = (
                 f"'{address}' has {n} value{'s' if n > 1 else ''}, but '{first}' in its group has {n_first}"
             )
-            raise axis.key.error(what, "as many", "for every combination, make each a group of its own")
+            raise axis.key.error(what, "as many values", "for every combination, put each into its own group")
     seen: set[str] = set()
     for i, node in enumerate(group[0].values if group else ()):
         position = json.dumps([axis.values[i].plain() for axis in group])
@@ -426,15 +428,15 @@ def _check_together(group: Sequence[Axis]) -> None:
 
 
 def _refuse_twice(groups: Sequence[Group]) -> None:
-    """Raise for two addresses, both with their location, of which one contains the other."""
+    """Raise for two addresses with locations if one contains the other."""
     axes = [axis for group in groups for axis in group]
     for i, axis in enumerate(axes):
         for other in axes[:i]:
             n = min(len(axis.loc), len(other.loc))
             if n and axis.of_profile == other.of_profile and axis.loc[:n] == other.loc[:n]:
                 address, other_address = clean(axis.address), clean(other.address)
-                what = f"'{address}' is scanned, and so is '{other_address}', which holds the same value"
-                raise axis.key.error(what, "each value in one place of the scan")
+                what = f"'{address}' and '{other_address}' are both scanned and share a value"
+                raise axis.key.error(what, "each value only once in the scan")
 
 
 def _is_free(axis: Axis, fixed: Sequence[Override], document: Document, notes: list[str]) -> bool:
@@ -466,7 +468,7 @@ def _read_adaptive(document: Document, fixed: Sequence[Override]) -> AdaptiveSca
     problems, notes, groups, repeats = ProblemCollector(), list[str](), list[Group](), _repeats(document)
     if document.get(("order",)) is not None:
         what = "'order' is given, but the points are chosen one after another"
-        problems.add(document.error(("order",), what, "no 'order' beside 'use'", key=True))
+        problems.add(document.error(("order",), what, "no 'order' for an adaptive scan", key=True))
     for address, range_ in choice.over.items():
         with problems:
             axis = _range_axis(document, address, range_.steps or 0)
@@ -477,11 +479,11 @@ def _read_adaptive(document: Document, fixed: Sequence[Override]) -> AdaptiveSca
     if not n_points and type(shots) is int and shots >= 1:
         n_points = math.ceil(shots / repeats)
     if not n_points:
-        what = "'points' is missing from 'scan' (the maximum number of points)"
+        what = "'points' (the maximum number of points) is missing from 'scan'"
         problems.add(document.error(("scan",), what, "a whole number"))
     problems.raise_any()
     if not groups:
-        raise document.error(("scan", "over"), "nothing is left to choose: options set every address")
+        raise document.error(("scan", "over"), "nothing is left to choose because options set every address")
     return AdaptiveScan(
         tuple(groups), repeats, "sequential", tuple(notes), choice=choice, max_points=n_points
     )
@@ -496,7 +498,7 @@ def _range_axis(document: Document, address: str, n_steps: int) -> RangeAxis:
     if not low.amount < high.amount:
         limits = [shown(node.plain(), node.raw) for node in (low_node, high_node)]
         what = f"'{clean(address)}' goes from {limits[0]} to {limits[1]}"
-        raise document.error((*loc, "to"), what, "a greatest value above the least")
+        raise document.error((*loc, "to"), what, "'to' above 'from'")
     return _placed(RangeAxis(address, (), ends, key, low, high, n_steps, mark), document)
 
 
@@ -504,7 +506,7 @@ _A = TypeVar("_A", bound=Axis)
 
 
 def _placed(axis: _A, document: Document) -> _A:
-    """An axis with its location in the sequence; an axis of the profile is located later.
+    """An axis with its location in the sequence. An axis of the profile is located later.
 
     Raises:
         ConfigError: The address does not exist, or a scan cannot change its setting.
@@ -542,7 +544,7 @@ def _placed_in_profile(axis: Axis, document: Document) -> Axis:
 
 
 def _found(axis: _A, document: Document) -> _A:
-    """An axis with the location of its address; a variable must exist."""
+    """An axis with the location of its address. A variable must exist."""
     try:
         loc = find(document.root, axis.address.removeprefix(PROFILE), may_add=MAY_ADD)
     except ConfigError as error:
@@ -577,7 +579,7 @@ def numbers_of(nodes: Sequence[Node]) -> list[Number]:
     """Read numbers of one dimension, all in the unit of the first.
 
     Raises:
-        ConfigError: One is not a number, or is of another dimension than the first.
+        ConfigError: A value is not a number, or has another dimension than the first.
     """
     numbers: list[Number] = []
     for node in nodes:
@@ -600,7 +602,7 @@ def _number(node: Node) -> Number:
         return Number(float(value), "", isinstance(value, int))
     amount, unit = split_quantity(value) if isinstance(value, str) else (math.nan, "")
     if not math.isfinite(amount) or not any(unit in units for units in UNITS.values() if unit):
-        what = f"{shown(node.plain(), node.raw)} is among the limits of a scan"
+        what = f"{shown(node.plain(), node.raw)} is not a valid limit of a scan"
         raise node.mark.error(what, "a number, or a number with a unit such as '50 um/ms'")
     return Number(amount, unit, is_whole=False)
 
@@ -616,7 +618,7 @@ def values_of(node: Node, address: str) -> list[Node]:
         address: The address, for messages.
 
     Raises:
-        ConfigError: It is neither a list nor one of :data:`FORMS`, is empty, or has more than
+        ConfigError: ``node`` is neither a list nor one of :data:`FORMS`, is empty, or has more than
             :data:`MAX_POINTS` values.
     """
     if isinstance(node.value, list):
@@ -638,19 +640,19 @@ def values_of(node: Node, address: str) -> list[Node]:
 
 
 def _linspace(_: Mark, limits: list[Node]) -> tuple[list[float], Number]:
-    """The values of a ``linspace``, in the unit of the first; integers if both ends are integers."""
+    """The values of a ``linspace``, in the unit of the first, as integers if both ends are integers."""
     first, last, n_values = _ends(limits)
     amounts = np.linspace(first.amount, last.amount, n_values).tolist()
     return amounts, first._replace(is_whole=first.is_whole and last.is_whole)
 
 
 def _geomspace(mark: Mark, limits: list[Node]) -> tuple[list[float], Number]:
-    """The values of a ``geomspace``, in the unit of the first; rounded to three digits but for the ends."""
+    """The values of a ``geomspace``, in the unit of the first. All but the ends have three digits."""
     first, last, n_values = _ends(limits)
     if not first.amount * last.amount > 0:
-        raise mark.error("the ends of a geomspace have no ratio", "both above 0, or both below")
+        raise mark.error("a geomspace cannot reach or cross 0", "both ends above 0, or both below")
     amounts = np.geomspace(first.amount, last.amount, n_values).tolist()
-    amounts[1:-1] = [float(f"{amount:.3g}") for amount in amounts[1:-1]]  # 31.6 ms, as one would write it
+    amounts[1:-1] = [float(f"{amount:.3g}") for amount in amounts[1:-1]]  # 31.6 ms, as a user would write it
     if len({*amounts}) < n_values:
         amounts = np.geomspace(first.amount, last.amount, n_values).tolist()
     return amounts, first._replace(is_whole=False)
@@ -666,7 +668,7 @@ def _ends(limits: list[Node]) -> tuple[Number, Number, int]:
 
 
 def _range(mark: Mark, limits: list[Node]) -> tuple[list[float], Number]:
-    """The values of a ``range``, in the unit of its start; integers if start and step are integers."""
+    """The values of a ``range``, in the unit of its start, as integers if start and step are integers."""
     start, stop, step = numbers_of(limits)
     n_steps = (stop.amount - start.amount) / step.amount if step.amount else math.nan
     if not n_steps >= 0:
@@ -684,7 +686,7 @@ FORMS: Final[Mapping[str, tuple[str, Callable[[Mark, list[Node]], tuple[list[flo
     "geomspace": ("[first, last, number of values]", _geomspace),
     "range": ("[start, stop, step]", _range),
 }
-"""How three numbers give the values of an address: name -> what the numbers are, and the values' function."""
+"""Name of a form of a scan -> the three numbers that it takes, and the function that makes its values."""
 
 
 def _written_node(amount: float, like: Number, mark: Mark) -> Node:

@@ -59,37 +59,37 @@ class CheckSettings(Settings):
             raise setting_error("the check has no limit", "'at_least', 'at_most' or both")
         if self.at_least is not None and self.at_most is not None and self.at_least > self.at_most:
             what = f"at_least is {self.at_least:g}, but at_most is {self.at_most:g}"
-            raise setting_error(what, "limits with something between them", at=("at_least",))
+            raise setting_error(what, "'at_most' above 'at_least'", at=("at_least",))
         return self
 
 
 class MeasureSettings(Settings):
-    """A quantity that the run is about, and how it depends on the scanned value."""
+    """A quantity that the run measures, and how it depends on the scanned value."""
 
     value: Text = Field(
         description="name of a quantity: `survival:before,after@target`, `filling`, "
         "`reading.laser.power_w`, `analysis.survival.survival`"
     )
     fit: Text | None = Field(
-        default=None, description="model that is fitted to it against the scanned value: `exponential`"
+        default=None, description="model to fit to it against the scanned value, such as `exponential`"
     )
     report: Text | None = Field(
-        default=None, description="parameter of the fit that is the result of the run; by default its first"
+        default=None, description="parameter of the fit that is the result of the run, by default its first"
     )
     parameters: Annotated[dict[str, int | float | str], empty_is({})] = Field(
-        default={}, description="parameters of the fit that are fixed: `{offset: 0}`; `free` frees one"
+        default={}, description="fixed parameters of the fit: `{offset: 0}`. The value `free` frees one"
     )
     stop_when: Annotated[dict[str, int | float | str], empty_is({})] = Field(
         default={},
-        description="errors of parameters at which the run ends before its last shot: "
-        "`{decay: 2 %}` of its value, or `{decay: 0.5 s}`",
+        description="errors of parameters below which the run ends before its last shot, "
+        "relative as in `{decay: 2 %}` or absolute as in `{decay: 0.5 s}`",
     )
 
     @model_validator(mode="after")
     def _has_a_fit(self) -> Self:
         for key in ("report", "parameters", "stop_when"):
             if self.fit is None and getattr(self, key):
-                raise setting_error(f"'{key}' without a fit", "'fit' as well", at=(key,), key=True)
+                raise setting_error(f"'{key}' is given without a fit", "'fit' as well", at=(key,), key=True)
         return self
 
 
@@ -105,7 +105,7 @@ def _each_once(measures: tuple[MeasureSettings, ...]) -> tuple[MeasureSettings, 
     names = [measure.value for measure in measures]
     for i, name in enumerate(names):
         if name in names[:i]:
-            expected = "each quantity once; `labseq show --scan QUANTITY --fit MODEL` fits it with others"
+            expected = "each quantity once (`labseq show --scan QUANTITY --fit MODEL` fits other models)"
             raise setting_error(f"'{clean(name)}' is listed a second time", expected, at=(i,))
     return measures
 
@@ -113,7 +113,7 @@ def _each_once(measures: tuple[MeasureSettings, ...]) -> tuple[MeasureSettings, 
 _Measure = Annotated[MeasureSettings, BeforeValidator(_as_mapping)]
 _MeasureList = Annotated[tuple[_Measure, ...], Field(min_length=1), AfterValidator(_each_once)]
 Measures: TypeAlias = Annotated[_MeasureList | None, BeforeValidator(_as_list)]
-"""What a run measures, the most important first; None to choose it by the steps."""
+"""The quantities that a run measures, the most important first. None to choose them by the steps."""
 
 
 _WORD: Final = re.compile(r"[^\W\d][\w-]*")
@@ -134,15 +134,16 @@ _Sites = Annotated[list[_Site], Field(min_length=1)]
 Regions: TypeAlias = Annotated[
     dict[str, str | _Sites | dict[str, Any]], empty_is({}), AfterValidator(_check_region_names)
 ]
-"""Name -> rows and columns as text, a list of sites, or a pattern, which is checked later."""
+"""Name -> rows and columns as text, a list of sites, or a pattern. The pattern is checked later."""
 
 
 class PolicySettings(Settings):
-    """``policy`` of a sequence: reactions to failures, for the run and every step without its own policy."""
+    """``policy`` of a sequence: reactions to failures for the run and for steps without their own policy."""
 
     on_failure: Then | None = Field(
         default=None,
-        description="reaction to a failure; none: a transient one repeats the shot, any other stops the run",
+        description="reaction to a failure. By default a transient failure repeats the shot, any other stops "
+        "the run",
     )
     when_exhausted: WhenExhausted = Field(
         default="stop", description="reaction when a shot has failed `attempts` times"
@@ -160,13 +161,13 @@ class AnalysisChoice(Choice):
 
     finish_within: Duration = Field(
         default=10.0,
-        description="how long it may continue after the run, for shots that it has not analysed yet; "
-        "and how long a run waits for a result that a check or an adaptive scan needs",
+        description="how long it may continue after the run, for shots that it has not analysed yet. "
+        "Also how long a run waits for a result that a check or an adaptive scan needs",
     )
 
 
 def _listed(choices: tuple[AnalysisChoice, ...]) -> tuple[AnalysisChoice, ...]:
-    """Add to each analysis its location; raise for duplicate names, which are also names of files."""
+    """Add to each analysis its location. Raise for duplicate names, because they are also names of files."""
     first: dict[str, int] = {}
     for i, choice in enumerate(choices):
         if first.setdefault(choice.use, i) != i:
@@ -187,7 +188,7 @@ class StepSpec:
 
     Attributes:
         kind: Name of the step in the registry: "load", "image", ...
-        name: The step's own name, for addresses; "" if it has none.
+        name: The step's own name, for addresses. "" if it has none.
         loc: Location of the mapping of its settings in the document.
     """
 
@@ -202,7 +203,7 @@ class StepSpec:
 
 
 def _step(value: Any) -> StepSpec:
-    """Read one item of ``shot``; its index is added later."""
+    """Read one item of ``shot``. Its index is added later."""
     if isinstance(value, str) and _WORD.fullmatch(value):
         raise setting_error(f"a step is just '{value}'", "a mapping", f"write '- {value}: {{}}'")
     if not isinstance(value, dict):
@@ -244,7 +245,7 @@ Steps: TypeAlias = Annotated[
 
 
 class LeaderPermissions(Settings):
-    """``leader`` of a sequence: what another control system may set for each shot."""
+    """``leader`` of a sequence: the settings that another control system may change for each shot."""
 
     may_set: Annotated[tuple[Text, ...], Field(min_length=1)] = Field(
         description="addresses in `planner`, `target`, `shot.N.<step>` or `variables`, as for `--set`"
@@ -252,20 +253,20 @@ class LeaderPermissions(Settings):
 
 
 class SequenceSpec(Settings):
-    """A sequence file; the settings of its plugins are checked later."""
+    """A sequence file. The settings of its plugins are checked later."""
 
     labseq: FormatVersion = Field(description="version of the file format: 1")
     name: Name = Field(description="name of the sequence and of its run folders")
     profile: Text = Field(default="virtual", description="hardware profile: a name, or a path to its file")
     shots: int = Field(ge=1, le=1_000_000, description="how many shots a run takes")
     seed: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
-        default=None, description="seed of all random numbers; without one, each run draws a fresh one"
+        default=None, description="seed of all random numbers. Without it, each run draws a new seed"
     )
     target: Annotated[PatternChoice, placed_by_field] | None = Field(
         default=None,
-        description="the pattern of atoms to end with; only a sequence that rearranges needs one",
+        description="the final pattern of atoms. Only a sequence that rearranges needs it",
     )
-    planner: Annotated[Choice, placed_by_field] = Field(description="what decides the moves")
+    planner: Annotated[Choice, placed_by_field] = Field(description="the plugin that plans the moves")
     record_frames: Literal["all", "last", "none"] = Field(
         default="all", description="which camera frames of a shot are kept"
     )
@@ -278,21 +279,22 @@ class SequenceSpec(Settings):
     )
     alarms: bool = Field(
         default=True,
-        description="whether shots give the alarms of the profile; false where no atoms are meant",
+        description="whether shots give the alarms of the profile. Use false if no atoms are expected",
     )
     plugin_folders: Folders = Field(default=[], description="folders with plugins, relative to this file")
     scan: dict[str, Any] | list[dict[str, Any]] | None = Field(
         default=None, description="addresses whose values change from shot to shot"
     )
-    repeats: int = Field(default=1, ge=1, le=1_000_000, description="shots of each point of the scan")
+    repeats: int = Field(default=1, ge=1, le=1_000_000, description="shots at each point of the scan")
     order: ScanOrder = Field(default="sequential", description="order of the scan's shots")
     leader: LeaderPermissions | None = Field(
-        default=None, description="what another control system may set for each shot, with its `go`"
+        default=None,
+        description="settings that another control system may change with each `go`",
     )
     measure: Measures = Field(
         default=None,
-        description="the quantities that the run is about, the most important first; "
-        "by default `filling` and `defect_free` with a target, else the survival between the last two images",
+        description="the quantities that the run measures, the most important first. By default "
+        "`filling` and `defect_free` with a target, else the survival between the last two images",
     )
     regions: Regions = Field(
         default={},
@@ -329,11 +331,11 @@ def load_sequence(
 
     Args:
         overrides: Values that replace those in the file.
-        profile_set: Overrides of the profile, with their "profile."; they replace a scan of their address.
+        profile_set: Overrides of the profile, with their "profile.". They replace a scan of their address.
 
     Returns:
-        The document, with overrides, the default planner and the first point of its scan; its content, with
-        fallbacks for wrong values; and the scan, its profile axes not yet bound.
+        The document with overrides, the default planner and the first point of its scan. The content of the
+        document, with fallbacks for wrong values. The scan. Its axes in the profile have no locations yet.
 
     Raises:
         ConfigError: All errors, except in settings of plugins.
@@ -341,12 +343,12 @@ def load_sequence(
     document = Document.read(path, kept)
     check_kind(document, "sequence")
     if document.get(("planner",)) is None:
-        # as an override, so that a message about it names no place in the file
+        # as an override, so that messages about it give no place in the file
         document = document.override("planner", f"{{use: {DEFAULT_PLANNER}}}", "the default planner")
     with collecting(problems) as collector:
         document = document.override_all(overrides, collector, may_add=("policy",)).evaluated()
         scan: Scan | None = None
-        # before the values of the file are checked: those of the first point take the place of some
+        # before the values of the file are checked, because the first point replaces some of them
         if document.get(("scan",)) is None:
             _refuse_without_scan(document, collector)
         else:
@@ -361,4 +363,4 @@ def _refuse_without_scan(document: Document, problems: ProblemCollector) -> None
     for key in ("repeats", "order"):
         if document.get((key,)) is not None:
             what = f"'{key}' is given without a scan"
-            problems.add(document.error((key,), what, "a 'scan' beside it", key=True))
+            problems.add(document.error((key,), what, "a 'scan' as well", key=True))

@@ -1,4 +1,4 @@
-"""Explains syntax errors of YAML: common mistakes in our own words, the others in PyYAML's."""
+"""Explains syntax errors of YAML. Rare mistakes keep PyYAML's message."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def explain_syntax_error(
 
     Args:
         last: The event before the error.
-        opened: The innermost bracket that is open at the error; None outside of brackets.
+        opened: The innermost bracket that is open at the error. None outside of brackets.
 
     Returns:
         The problem, with line and column but without a source.
@@ -52,7 +52,7 @@ def _at(mark: YamlMark, what: str, expected: str = "", hint: str = "") -> Proble
 
 
 def _wrong_escape(text: str, at: YamlMark) -> Problem:
-    """Explain a backslash in double quotes, mostly of a path of Windows."""
+    """Explain a backslash in double quotes, usually in a Windows path."""
     start = text.rindex("\\", 0, at.index + 1)
     escape = clean(text[start : start + 2])
     what = f"in double quotes a backslash begins an escape, and '{escape}' is not a complete one"
@@ -72,14 +72,14 @@ def _stray_colon(text: str, at: YamlMark) -> Problem:
     spaces = len(before) - len(before.lstrip())
     above, line = _line_above(text, at)
     if ": " not in before and line and spaces > above:
-        what = f"this line is indented further than line {line}, which has a value already"
-        return _at(at, what, f"{above} spaces as there")
+        what = f"this line is indented further than line {line}, which already has a value"
+        return _at(at, what, f"{above} spaces as in line {line}")
     hint = "put text that holds ': ' in quotes"
     return _at(at, "a ':' is not allowed here", "one 'key: value' on a line", hint)
 
 
 def _line_above(text: str, at: YamlMark) -> tuple[int, int]:
-    """Column of the first key on the nearest line above that is not empty, and its number, from 1."""
+    """Column of the first key on the nearest non-empty line above, and the line's number, from 1."""
     lines = re.split(r"\r\n|\r|\n", text[: at.index])[:-1]
     for number in range(len(lines), 0, -1):
         if match := re.match(r" *(?:- +)*(?=[^ #])", lines[number - 1]):
@@ -93,13 +93,13 @@ def _wrong_in_brackets(text: str, opened: YamlMark, at: YamlMark) -> Problem:
     closer = "]" if bracket == "[" else "}"
     expected = f"',' or '{closer}'"
     if at.line == opened.line and at.index < len(text):
-        what = f"the {bracket}...{closer} that opens in column {opened.column + 1} goes wrong here"
+        what = f"the {bracket}...{closer} that opens in column {opened.column + 1} has an error here"
         return _at(at, what, expected)
     return _at(opened, f"the '{bracket}' that opens here is not closed", expected)
 
 
 def _late_quote(last: Event | None, at: YamlMark) -> Problem | None:
-    """Explain a quoted text that ends lines too late, at the next quotation mark; None for other errors."""
+    """Explain a quoted text that ends lines too late, at the next quotation mark. None for other errors."""
     if not isinstance(last, ScalarEvent) or last.style not in ("'", '"'):
         return None
     start, end = cast("YamlMark", last.start_mark), cast("YamlMark", last.end_mark)
@@ -110,16 +110,16 @@ def _late_quote(last: Event | None, at: YamlMark) -> Problem | None:
 
 
 def _out_of_place(text: str, since: YamlMark, at: YamlMark) -> Problem:
-    """Explain a line that continues no block above it, or what follows a complete value on its line."""
+    """Explain a line that continues no block above it, or text after a complete value on its line."""
     if text[at.index - at.column : at.index].strip():
         return _at(at, "this does not belong here", "the end of the line", _QUOTE_IT)
     if at.column == since.column:
         return _at(
             at, "this line does not continue the block above", "'- ' in a list, 'key: value' otherwise"
         )
-    what = "the indentation of this line fits no line above"
+    what = "the indentation of this line matches no line above"
     if text[at.index] == "-":
-        return _at(at, what, "that of the other items of the list")
+        return _at(at, what, "the indentation of the other list items")
     above, line = _line_above(text, at)
     other = f" or {since.column} as in line {since.line + 1}" if since.column != above else ""
     return _at(at, what, f"{above} spaces as in line {line}{other}")

@@ -1,4 +1,4 @@
-"""Validates values with a settings model; every mistake has its line and column."""
+"""Validates values with a settings model, and gives every mistake its line and column."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ M = TypeVar("M")
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A problem, still without its place in the file.
+    """A problem whose place in the file is not known yet.
 
     Attributes:
-        loc: The location, from the mapping that is validated.
+        loc: The location, relative to the validated mapping.
         problem: The problem.
-        key: Whether the problem is about the key at that location, not its value.
+        key: Whether the problem is about the key at that location, not about its value.
     """
 
     loc: Loc
@@ -48,11 +48,11 @@ class ValidationContext:
     """Names and keys of a mapping, for messages.
 
     Attributes:
-        name: Name of the mapping in messages; "" at the top of a file.
-        called: Its description in messages; "" for its name.
-        core_keys: Keys that belong to another model and are left out; messages list them as known.
-        folder: Folder that the paths in it are relative to.
-        needs_units: Whether a quantity needs its unit, as in a file; otherwise numbers are in SI.
+        name: Name of the mapping in messages. "" at the top of a file.
+        called: Description of the mapping in messages. "" for its name.
+        core_keys: Keys that belong to another model and are left out. Messages list them as known.
+        folder: Paths in the mapping are relative to this folder.
+        needs_units: Whether a quantity needs its unit, as in a file. Otherwise numbers are in SI.
     """
 
     name: str
@@ -65,7 +65,7 @@ class ValidationContext:
         """The keys of the mapping at a location."""
         keys = [setting.key for one in models_at(model, loc) for setting in settings_of(one)]
         if not loc:
-            # the key that names the plugin is right, or its settings would not be looked at
+            # the key that names the plugin must be right, or its settings would not be validated
             others = sorted({*self.core_keys} - {"use", "pattern"})
             keys = [*(key for key in keys if key not in self.core_keys), *others]
         return list(dict.fromkeys(keys))
@@ -77,13 +77,13 @@ class ValidationContext:
         return self.called or (f"'{self.name}'" if self.name else "this file")
 
     def value(self, loc: Loc) -> str:
-        """The name of the value at a location, for messages: its key, and the list indices after it."""
+        """The name of the value at a location, for messages: key and following list indices."""
         last = next((i for i in reversed(range(len(loc))) if isinstance(loc[i], str)), 0)
         return ".".join(map(str, loc[last:])) if loc else self.name
 
 
 def validate(model: type[M], node: Node, context: ValidationContext) -> M:
-    """Validate a mapping with a settings model; an empty value counts as {}.
+    """Validate a mapping with a settings model. An empty value counts as {}.
 
     Raises:
         ConfigError: All errors in the mapping, in file order.
@@ -98,7 +98,7 @@ def validate(model: type[M], node: Node, context: ValidationContext) -> M:
 
 
 def check(model: type[M], node: Node, context: ValidationContext) -> M | list[Finding]:
-    """Validate a mapping with a settings model; returns the settings, or all errors."""
+    """Validate a mapping with a settings model, and return the settings or all errors."""
     data = {} if node.value is None else node.plain()
     if not isinstance(data, dict):
         what = f"{context.name} is {shown(data, node.raw)}"
@@ -112,7 +112,7 @@ def check(model: type[M], node: Node, context: ValidationContext) -> M | list[Fi
         return find_problems(error, model, node, context)
     except Exception as error:  # noqa: BLE001 - a plugin's own validator may raise anything
         reason = format_plugin_error(error)
-        return [Finding((), Problem(f"these settings make the plugin's check fail: {reason}"))]
+        return [Finding((), Problem(f"the plugin's check of these settings failed: {reason}"))]
 
 
 @cache
@@ -121,12 +121,12 @@ def _adapter(model: type[M]) -> TypeAdapter[M]:
 
 
 def _validated(model: type[M], text: str, context: Mapping[str, Any]) -> M:
-    """Validate JSON, because there strict means: no number out of a text, but a tuple out of a list."""
+    """Validate as JSON. Strict mode then reads no number from a text, but still makes tuples from lists."""
     adapter = _adapter(model)
     try:
         return adapter.validate_json(text, strict=True, context=context, by_alias=True, by_name=False)
     except ValidationError as error:
-        # Behind a validator of the model's own, strict wants a tuple from the start.
+        # After a validator of the model itself, strict mode requires a tuple from the start.
         if all(is_list_for_tuple(details) for details in error.errors(include_url=False)):
             return adapter.validate_json(text, context=context, by_alias=True, by_name=False)
         raise
@@ -145,12 +145,12 @@ def validate_values(model: type[M] | None, values: Mapping[str, Any], called: st
     """Validate Python values with a settings model, by the same rules as for a file.
 
     Args:
-        model: The settings model; None for a plugin that takes no settings.
-        values: Setting -> value; numpy's numbers and arrays count as plain ones.
-        called: Owner of the settings, for messages: "planner 'psca'".
+        model: The settings model. None for a plugin that takes no settings.
+        values: Setting -> value. Numpy's numbers and arrays count as plain ones.
+        called: Owner of the settings, for messages, such as "planner 'psca'".
 
     Raises:
-        ConfigError: All errors in them.
+        ConfigError: All errors in the values.
     """
     root = node_of(dict(values), Mark(called))
     settings = validate(model or NoSettings, root, ValidationContext("", "it"))
@@ -175,7 +175,7 @@ def node_of(value: Any, mark: Mark) -> Node:
     if isinstance(value, PurePath):
         return Node(str(value), mark)
     if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
-        raise mark.error(f"there is half a character in '{clean(value)}'", "text")
+        raise mark.error(f"'{clean(value)}' contains half a character", "text")
     if value is None or isinstance(value, str | int | float):
         return Node(value, mark)
     kind = type(cast("object", value)).__name__

@@ -17,8 +17,8 @@ from labseq.settings import Setting, SettingsType, settings_at
 from labseq.units import expected as expected_quantity, with_units
 
 MAX_HINTS: Final = 50
-"""Number of unknown keys of a mapping that are compared with the known ones, which takes time. A file with
-more of them is probably of another kind."""
+"""Maximum number of unknown keys of a mapping that are compared with known keys, which takes time. A file
+with more unknown keys is probably of another kind."""
 
 
 def _is_long_enough(error: Mapping[str, Any]) -> bool:
@@ -32,7 +32,7 @@ class _Placed:
 
     Attributes:
         error: pydantic's error.
-        loc: Location below the mapping; it may end with a missing key.
+        loc: Location below the mapping. It may end with a missing key.
         union: Location of the union type in which it occurred, or None.
         branch: The branch of the union.
     """
@@ -56,14 +56,14 @@ class _Placed:
 def find_problems(
     error: ValidationError, model: SettingsType, top: Node, context: ValidationContext
 ) -> list[Finding]:
-    """What pydantic found wrong, without what follows from it: a misspelt key is not missing as well."""
+    """Pydantic's errors without their consequences. A misspelt key, for example, is not missing as well."""
     raised = cast("list[Mapping[str, Any]]", error.errors(include_url=False))
     errors = [
         _place(details, top)
         for details in raised
         if not (is_list_for_tuple(details) or _is_long_enough(details))
     ]
-    # Of a value that fits none of several types, only the errors of one type are reported.
+    # If a value fits none of several types, only the errors of one type are reported.
     reported = [placed for placed in errors if placed.union is None]
     unions: dict[Loc, list[_Placed]] = {}
     for placed in errors:
@@ -89,13 +89,13 @@ def find_problems(
             # The last missing item says how many entries are needed.
             if (*loc[:-1], index + 1) not in missing:
                 findings.append(_missing_item(loc[:-1], index, top, context))
-        elif loc not in misspelt:  # a misspelt key is not missing as well
+        elif loc not in misspelt:  # a misspelt key is not also missing
             findings.append(_missing_key(loc, model, top, context))
     return findings
 
 
 def _place(error: Mapping[str, Any], top: Node) -> _Placed:
-    """Follow pydantic's location through the file; parts that are neither key nor index name a branch."""
+    """Follow pydantic's location through the file. Parts that are neither key nor index name a branch."""
     steps: tuple[str | int, ...] = error["loc"]
     loc: Loc = ()
     union: Loc | None = None
@@ -113,7 +113,7 @@ def _place(error: Mapping[str, Any], top: Node) -> _Placed:
 
 
 def _best_branch(union: list[_Placed]) -> list[_Placed]:
-    """The errors of the most likely branch: the one in which the longest part is valid."""
+    """The errors of the most likely branch, in which the longest part is valid."""
     branches: dict[str, list[_Placed]] = {}
     for placed in union:
         branches.setdefault(placed.branch, []).append(placed)
@@ -267,7 +267,7 @@ def explain(error: Mapping[str, Any], name: str, value: Any, raw: str) -> Proble
 
 
 def _of_validator(text: str, name: str, plain: str) -> Problem:
-    """The message of a validator's ValueError, on one line; one that begins with "expected" has no value."""
+    """The message of a validator's ValueError, on one line, with the value before "expected ..."."""
     text = " ".join(text.split())
     if text.startswith("expected "):
         return Problem(plain, expected=text.removeprefix("expected "))
@@ -275,7 +275,7 @@ def _of_validator(text: str, name: str, plain: str) -> Problem:
 
 
 def _type_hint(kind: str, value: Any) -> str:
-    """A hint for a text in the place of a number or a switch, or vice versa."""
+    """A hint for a text instead of a number or a switch, or vice versa."""
     if kind.startswith("int") and isinstance(value, float) and value.is_integer():
         return f"write {value:.0f}"
     if not isinstance(value, str):

@@ -1,9 +1,8 @@
 """Reads YAML text into nodes that carry their line and column.
 
-PyYAML composes its node graph, which is checked while it grows and converted to :class:`Node`.
-PyYAML's constructor is not used, so no tag can run code. Scalars follow the core rules of YAML 1.2.
-Under YAML 1.1, PyYAML's default, ``off`` would be False, ``10:30`` 630 and ``2026-01-01`` a date. Here
-they are text.
+PyYAML composes its node graph, which is checked while it grows and converted to :class:`Node`. PyYAML's
+constructor is not used, so no tag can run code. Scalars follow the core rules of YAML 1.2. Under YAML 1.1,
+PyYAML's default, ``off`` would be False, ``10:30`` 630 and ``2026-01-01`` a date. Here all three are text.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ MAX_DEPTH: Final = 32
 """Maximum depth of nested lists and mappings."""
 
 MAX_DIGITS: Final = 100
-"""Maximum length of a number, in characters; Python refuses much longer ones, or takes long."""
+"""Maximum length of a number, in characters. Python refuses much longer numbers, or takes long."""
 
 
 class Mark(NamedTuple):
@@ -40,8 +39,8 @@ class Mark(NamedTuple):
 
     Attributes:
         source: Name of the file in messages, or an option such as ``--set shots=5``.
-        line: Line, from 1; 0 in an option.
-        column: Column, from 1; in an option that of the name, which ends with its text, or 0 for all of it.
+        line: Line, from 1. 0 in an option.
+        column: Column, from 1. In an option, the column within ``source``, or 0 for the whole option.
     """
 
     source: str
@@ -51,7 +50,7 @@ class Mark(NamedTuple):
     def problem(self, what: str, expected: str = "", hint: str = "") -> Problem:
         """Create a problem at this place.
 
-        Unprintable characters are escaped: validators, those of plugins too, quote values unchanged.
+        Unprintable characters are escaped, because validators (also of plugins) quote values unchanged.
         """
         return Problem(visible(what), self.source, self.line, self.column, visible(expected), visible(hint))
 
@@ -61,7 +60,7 @@ class Mark(NamedTuple):
 
     @property
     def order(self) -> tuple[bool, int, int]:
-        """Sorting key: the file in its order, then the options."""
+        """Sorting key that puts places in the file first, in order, then the options."""
         return self.line == 0, self.line, self.column
 
 
@@ -73,7 +72,7 @@ class Node:
         value: A scalar, or the nodes of a list or mapping.
         mark: Start of the value.
         keys: Start of each key of a mapping.
-        raw: An unquoted scalar as it is written; "" for everything else.
+        raw: An unquoted scalar as it is written. "" for everything else.
     """
 
     value: Scalar | list[Node] | dict[str, Node]
@@ -97,7 +96,7 @@ class Node:
         return [leaf for step, child in steps for leaf in child.leaves((*loc, step))]
 
     def child(self, step: str | int) -> Node | None:
-        """The value of a key or of a list index; None if it is missing."""
+        """The value of a key or of a list index, or None if it is missing."""
         if isinstance(self.value, dict):
             return self.value.get(step) if isinstance(step, str) else None
         if isinstance(self.value, list) and isinstance(step, int) and 0 <= step < len(self.value):
@@ -105,14 +104,14 @@ class Node:
         return None
 
     def at(self, loc: Loc) -> Node | None:
-        """The node at a location; None if it is missing."""
+        """The node at a location, or None if it is missing."""
         node: Node | None = self
         for step in loc:
             node = node.child(step) if node is not None else None
         return node
 
     def mark_at(self, loc: Loc, key: bool = False) -> Mark:
-        """Start of the value at ``loc`` (or of its key); if it is missing, that of its nearest parent."""
+        """Start of the value at ``loc`` or of its key, or of the nearest parent if that is missing."""
         node = self
         for i, step in enumerate(loc):
             child = node.child(step)
@@ -126,14 +125,14 @@ class Node:
     def replaced(self, loc: Loc, new: Node, *, key: Mark | None = None, same_key: bool = False) -> Node:
         """A copy with the value at ``loc`` replaced, or added to a mapping.
 
-        The parents must exist; an empty parent becomes a mapping.
+        The parents must exist. An empty parent becomes a mapping.
 
         Args:
             loc: The location.
             new: The new value.
-            key: The place of its key; None for the place of the new value: an option that replaces a value
-                gives its key too.
-            same_key: Whether problems of its key still belong to the place where the key is.
+            key: The place of its key. None for the place of the new value, because an option that replaces
+                a value also gives its key.
+            same_key: Whether problems of the key still refer to its place in the file.
         """
         if not loc:
             return new
@@ -187,14 +186,14 @@ def compose(text: str, source: str, *, is_option: bool = False) -> Node | None:
 
 
 class _Alias(yaml.Node):
-    """``*name``: the node that the anchor names, and the alias's own place."""
+    """An alias ``*name``, with the node of its anchor and its own place."""
 
     def __init__(self, node: yaml.Node, mark: YamlMark) -> None:
         super().__init__("alias", node, mark, mark)
 
 
 class _Composer(yaml.SafeLoader):
-    """Text to PyYAML's nodes, in pure Python, with the rules and limits checked on the way."""
+    """Converts text to PyYAML's nodes, in pure Python, and checks rules and limits while it reads."""
 
     def __init__(self, text: str, source: str, is_option: bool) -> None:
         super().__init__(text)
@@ -215,7 +214,7 @@ class _Composer(yaml.SafeLoader):
         raise ConfigError(self.problems)
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
-        """Compose the next node; ``index`` is the key's node for a value of a mapping."""
+        """Compose the next node. For a value of a mapping, ``index`` is the node of its key."""
         event = self.last = cast("Any", self.peek_event())
         if isinstance(event, AliasEvent):
             node: yaml.Node = self._alias(cast("Any", self.get_event()))
@@ -233,7 +232,7 @@ class _Composer(yaml.SafeLoader):
         return node
 
     def converted(self, node: yaml.Node, depth: int = 0, via: YamlMark | None = None) -> Node:
-        """Convert a node of PyYAML to a :class:`Node`; ``via`` is the alias that refers to it."""
+        """Convert a node of PyYAML to a :class:`Node`. ``via`` is the alias that refers to it."""
         mark = node.start_mark
         if isinstance(node, _Alias):
             via, node = via or mark, node.value
@@ -293,7 +292,7 @@ class _Composer(yaml.SafeLoader):
         return _Alias(self.anchors[name], event.start_mark)
 
     def _check_key(self, keys: dict[str, YamlMark], node: yaml.Node, value: yaml.Node) -> None:
-        """Report keys that are not a text, merge keys, and duplicate keys."""
+        """Report keys that are not text, merge keys, and duplicate keys."""
         key, mark, n_before = self.converted(node), node.start_mark, len(self.problems)
         if not isinstance(key.value, str):
             hint = f"write '{clean(key.raw)}' in quotes" if key.raw else ""
@@ -332,9 +331,9 @@ def _key_text(node: yaml.Node) -> str:
 
 
 def comma_hint(key: str, value: Any) -> str:
-    """A hint for a key such as "5 ms" without a value, from ``{exposure: 4,5 ms}``; else ""."""
+    """A hint for a key such as "5 ms" without a value, from ``{exposure: 4,5 ms}``, or else ""."""
     if value is None and key[:1].isdigit():
-        return "a ',' begins another key: write 4.5 for 4,5 and [4, 5] for a list"
+        return "a ',' begins another key, so write 4.5 for 4,5 and [4, 5] for a list"
     return ""
 
 
@@ -351,10 +350,10 @@ _FLOAT: Final = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0
 
 
 def resolve(text: str) -> Scalar:
-    """The value of an unquoted scalar by the core rules of YAML 1.2, but that 1e3 is a whole number.
+    """The value of an unquoted scalar by the core rules of YAML 1.2, except that 1e3 is a whole number.
 
     Raises:
-        ValueError: A number of more than :data:`MAX_DIGITS` characters.
+        ValueError: A number has more than :data:`MAX_DIGITS` characters.
 
     Example:
         >>> resolve("0x10"), resolve("1e3"), resolve("on"), resolve("10:30"), resolve("~")
@@ -376,12 +375,12 @@ def resolve(text: str) -> Scalar:
     return int(number) if is_whole else number
 
 
-# U+0085, U+2028 and U+2029 are line breaks for PyYAML but for few editors, so
-# that all line numbers after them would be wrong; U+FEFF cannot be seen.
+# U+0085, U+2028 and U+2029 are line breaks for PyYAML but not for most editors, so all
+# line numbers after them would be wrong. U+FEFF is invisible.
 _FORBIDDEN: Final = re.compile(
     "[^\t\n\r\x20-\x7e\xa0-\u2027\u202a-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]"
 )
-# At the beginning of a line, all other spaces are text to YAML and indentation to the eye.
+# At the beginning of a line, other kinds of space look like indentation but are text to YAML.
 _ODD_INDENT: Final = re.compile("^[ \t-]*([\u00a0\u1680\u2000-\u200a\u202f\u205f\u3000])", re.MULTILINE)
 
 
@@ -389,7 +388,7 @@ def _check_characters(text: str, source: str, is_option: bool) -> None:
     """Raise for control characters, unusual line breaks and spaces, and incomplete characters.
 
     Raises:
-        ConfigError: The text has such a character; names the place of the first one.
+        ConfigError: The text has such a character. The message gives the place of the first one.
     """
     match, group, expected, hint = _FORBIDDEN.search(text), 0, "plain text", "delete it"
     if match is None:
@@ -412,4 +411,4 @@ def _check_characters(text: str, source: str, is_option: bool) -> None:
 
 PATH_HINT: Final = "put a path into single quotes, or write '/' or two backslashes for each backslash"
 _IN_WINDOWS_PATH: Final = re.compile(r"(?:[A-Za-z]:|\\\w[^/]*)([\0\a\b\t\n\v\f\r\x1b])\w")
-"""A path such as "C:\\new" in double quotes, in which YAML reads an escape."""
+"""A path such as "C:\\new" in double quotes, where YAML reads "\\n" as an escape."""

@@ -1,4 +1,4 @@
-"""The frozen domain types: what the rest of labseq talks about."""
+"""The frozen domain types that all of labseq uses."""
 
 from labseq.model.calibration import (
     CALIBRATION_KINDS,

@@ -1,4 +1,4 @@
-"""A calibration: the values that the machine uses, their quality, and where they come from."""
+"""A calibration: the values that the machine uses, with their quality and origin."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ VALUE_SHAPES: Final[Mapping[str, Mapping[str, tuple[str | int, ...]]]] = Mapping
         "timing": {"overhead_s": (1,)},
     }
 )
-"""Kind -> the values that it must have, and their shapes; "rows" and "cols" are the grid's."""
+"""Kind -> the values that it must have, and their shapes. "rows" and "cols" are numbers of the grid."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationEntry:
-    """One calibration, as it is stored. It never changes; a new one is another entry.
+    """One calibration, as it is stored. It never changes, because a new calibration is another entry.
 
     Values by kind, float64, (y, x) for pixels:
 
@@ -45,8 +45,8 @@ class CalibrationEntry:
     - thresholds: ``thresholds`` (n_rows, n_cols), in the unit of the detector: counts over the
       offset, or log-odds.
     - tweezers: ``row_amplitudes`` (n_rows,), ``column_amplitudes`` (n_cols,) of the static tweezers' tones,
-      fractions of full scale; of tweezers with a weight for each site also ``weights`` (n_rows, n_cols).
-    - amplitudes: the same of the mobile tweezers' tones at the sites, above 0.
+      fractions of full scale, and for tweezers with a weight for each site ``weights`` (n_rows, n_cols).
+    - amplitudes: the same for the mobile tweezers' tones at the sites, above 0.
     - frequencies: ``row_hz`` (n_rows,), ``column_hz`` (n_cols,): the mobile tweezers' tones at the sites.
     - overlay: ``offset_m`` (2,): offset of the mobile tweezers from the sites, along a1 (along a
       row) and a2 (from row to row).
@@ -54,17 +54,17 @@ class CalibrationEntry:
 
     Attributes:
         kind: One of :data:`CALIBRATION_KINDS`.
-        values: What the machine uses; may contain more than those above.
-        quality: Figures of merit, in SI units and pixels; nan for unknown ones.
-        grid: ``rows``, ``cols``, ``spacing_m``, ``lattice`` and ``shear`` of the grid that it was made for.
-        origin: Where it comes from, JSON-ready: command, run, number of shots, profile, version of labseq,
-            ids of the other calibrations in use.
+        values: The values that the machine uses. It may contain more values than listed above.
+        quality: Figures of merit, in SI units and pixels. nan for unknown figures.
+        grid: ``rows``, ``cols``, ``spacing_m``, ``lattice`` and ``shear`` of the grid for which it was made.
+        origin: JSON-ready: command, run, number of shots, profile, version of labseq, ids of the other
+            calibrations in use.
         taken_utc: When it was made, ISO 8601, UTC.
-        id: From kind, grid, values and ``taken_utc``: the digits of their SHA-256 in hexadecimal from the
-            first letter on, twelve of them. YAML would read digits without a letter before them as a number.
+        id: Twelve hexadecimal digits of the SHA-256 of kind, grid, values and ``taken_utc``, beginning with
+            the first letter. Without a letter at the beginning, YAML could read the digits as a number.
 
     Raises:
-        ValueError: A value is missing, of another shape, not finite, or out of range.
+        ValueError: A value is missing, not finite or out of range, or has the wrong shape.
 
     Example:
         >>> entry = CalibrationEntry("overlay", {"offset_m": [3e-8, 0.0]}, {"error_m": 1e-8},
@@ -92,11 +92,11 @@ class CalibrationEntry:
         self._check_shapes()
         self._check_range()
         if datetime.fromisoformat(self.taken_utc).tzinfo is None:
-            raise ValueError(f"taken_utc is {self.taken_utc}, without a time zone")
+            raise ValueError(f"taken_utc is {self.taken_utc}, which has no time zone")
         set_field(self, "id", _content_id(self))
 
     def is_for(self, grid: SiteGrid) -> bool:
-        """Whether it was made for a grid of these sites; the tones of rows and columns are ignored."""
+        """Whether it was made for a grid with these sites. The tones of rows and columns are ignored."""
         return same_grid(self.grid, grid_facts(grid))
 
     def _check_shapes(self) -> None:
@@ -146,7 +146,7 @@ def grid_facts(grid: SiteGrid) -> dict[str, Any]:
 
 
 def same_grid(grid: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two grids have the same sites; the shear of a square lattice is ignored.
+    """Whether two grids have the same sites. The shear of a square lattice is ignored.
 
     Args:
         grid: From :func:`grid_facts`.
@@ -176,7 +176,7 @@ def _facts(grid: Mapping[str, Any]) -> dict[str, Any]:
 def _finite(name: str, value: ArrayLike) -> NDArray[np.float64]:
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
-        raise ValueError(f"'{name}' holds {array.dtype}, not numbers")
+        raise ValueError(f"'{name}' contains {array.dtype}, not numbers")
     if not np.isfinite(array).all():
         raise ValueError(f"'{name}' has values that are not finite")
     return read_only(array, np.float64, (-1,) * array.ndim, name)
@@ -193,12 +193,12 @@ def _content_id(entry: CalibrationEntry) -> str:
 def correct_overlay(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:
     """The same grid, with tones shifted so that the mobile tweezers are on the sites.
 
-    An axis of one site takes the mean step of the other axis, a grid of one site 1.6 MHz per spacing, by
-    which the offsets of a probe are made from tones too.
+    An axis of one site takes the mean step of the other axis, and a grid of one site takes 1.6 MHz per
+    spacing. The offsets of a probe use the same conversion.
 
     Args:
-        grid: The grid, with the tones that put the tweezers beside the sites.
-        offset_m: float64 (2,), how far beside: along a1 (along a row) and a2 (from row to row), in metres.
+        grid: The grid, with the tones that displace the tweezers from the sites.
+        offset_m: float64 (2,), displacement along a1 (along a row) and a2 (from row to row), in metres.
 
     Raises:
         LimitError: A tone is not above 0 Hz.
@@ -231,7 +231,7 @@ def _shifted(name: str, site_hz: Floats, other_hz: Floats, spacing_m: float, off
 
 
 def _along(x: Floats, knots: Floats, values: Floats) -> Floats:
-    """Interpolate linearly; extrapolate beyond the ends with the outermost step. ``knots`` rise."""
+    """Interpolate linearly, and extrapolate beyond the ends with the outermost step. ``knots`` rise."""
     i = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
     slope = np.diff(values) / np.diff(knots)
     return values[i] + slope[i] * (x - knots[i])

@@ -1,4 +1,4 @@
-"""Frames, and what a camera and its sensor can do."""
+"""Frames, and the modes and limits of cameras."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from labseq.model.grid import read_only
 from labseq.units import format_quantity
 
 BLOCK: Final = 32
-"""Rows that are transposed at once."""
+"""Number of rows that are transposed at once."""
 
 Flip: TypeAlias = Literal["none", "rows", "columns", "both"]
 
 
 @dataclass(frozen=True, slots=True)
 class Orientation:
-    """How an image lies relative to the frame that the sensor delivers.
+    """The orientation of an image relative to the frame from the sensor.
 
     Attributes:
         transpose: Whether rows and columns are exchanged, before the flip.
-        flip: What is reversed then: "none", the order of "rows" (upside down), of "columns" (left to right),
-            or "both".
+        flip: The order that is then reversed: "none", "rows" (upside down), "columns" (left to right), or
+            "both".
     """
 
     transpose: bool = False
     flip: Flip = "none"
 
     def apply(self, frame: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """The image (rows, columns); a view of the sensor's frame if that is not transposed.
+        """The image (rows, columns), which is a view of the sensor's frame unless it is transposed.
 
         Example:
             >>> Orientation(transpose=True, flip="rows").apply(np.array([[1, 2], [3, 4]], np.uint16)).tolist()
             [[2, 4], [1, 3]]
         """
         axes = {"none": (), "rows": (0,), "columns": (1,), "both": (0, 1)}[self.flip]
-        if self.transpose:  # in blocks that stay in the processor's cache, four times as fast as at once
+        if self.transpose:  # blocks stay in the processor's cache, which is four times as fast
             turned = np.empty(frame.shape[::-1], frame.dtype)
             for first in range(0, len(frame), BLOCK):
                 turned[:, first : first + BLOCK] = frame[first : first + BLOCK].T
@@ -58,10 +58,10 @@ class SensorMode:
     """How a sensor is exposed and read.
 
     Attributes:
-        region: (y, x, height, width) of the part of the sensor that is read, in its own pixels; None: all
-            of it.
-        binning: Pixels of the sensor per pixel of a frame, along each axis.
-        em_gain: Mean gain of the EM register; None where the camera does not set one.
+        region: (y, x, height, width) of the part of the sensor that is read, in sensor pixels. None for the
+            whole sensor.
+        binning: Sensor pixels per pixel of a frame, along each axis.
+        em_gain: Mean gain of the EM register. None if the camera sets no gain.
         shutter_open: Whether light reaches the sensor.
     """
 
@@ -81,15 +81,15 @@ class CameraFacts:
     """Facts about a camera that are known from its settings, before it is opened.
 
     Attributes:
-        readout_s: From the end of an exposure until the frame can be read, in seconds.
+        readout_s: Time from the end of an exposure until the frame can be read, in seconds.
         max_exposure_s: Longest exposure, in seconds.
-        frame_shape: (height, width) of its images, in their orientation; None if not known.
-        em_gain: Mean gain of the EM register in an exposure; 1 for a camera without one.
-        triggers: What may start its exposures: "software", "internal", "external", "external_start", "bulb".
-        min_exposure_s: Shortest exposure, in seconds; 0 if not known.
-        arm_s: Time that arming for a series takes, in seconds; 0 if not known.
-        line_trigger: Which of its triggers a line of the timing box gives.
-        cycle_s: With "external_start", from the start of one exposure to that of the next, in seconds.
+        frame_shape: (height, width) of its images, in their orientation. None if not known.
+        em_gain: Mean gain of the EM register in an exposure. 1 for a camera without EM register.
+        triggers: Possible triggers, of "software", "internal", "external", "external_start" and "bulb".
+        min_exposure_s: Shortest exposure, in seconds. 0 if not known.
+        arm_s: Time that arming for a series takes, in seconds. 0 if not known.
+        line_trigger: The trigger that a line of the timing box gives.
+        cycle_s: With "external_start", time between the starts of successive exposures, in seconds.
     """
 
     readout_s: float = 0.0
@@ -106,7 +106,7 @@ class CameraFacts:
         """Refuse an exposure that the camera cannot make.
 
         Raises:
-            LimitError: It is too short or too long.
+            LimitError: The exposure is too short or too long.
         """
         if exposure_s > 0 and self.min_exposure_s <= exposure_s <= self.max_exposure_s:
             return
@@ -126,8 +126,8 @@ class Frame:
         exposure_s: Exposure time, in seconds.
         t_start_s: Start of the exposure on the session's clock, in seconds.
         camera: Name of the camera.
-        number: Place in its series as the camera counted it, from 0.
-        device_time_s: The camera's own time stamp, in seconds from a zero of its own; nan if it gives none.
+        number: Index in its series as counted by the camera, from 0.
+        device_time_s: The camera's own time stamp, in seconds with an arbitrary zero. nan if it gives none.
     """
 
     image: NDArray[np.uint16]
@@ -139,6 +139,6 @@ class Frame:
 
     def __post_init__(self) -> None:
         image = np.asarray(self.image)
-        if image.dtype != np.uint16:  # never a silent conversion of raw data
+        if image.dtype != np.uint16:  # raw data are never converted silently
             raise ValueError(f"a frame is uint16, not {image.dtype}")
         object.__setattr__(self, "image", read_only(image, np.uint16, (-1, -1), "image"))

@@ -15,10 +15,10 @@ from labseq.units import with_error
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A value with its standard error; NaN if one could not be determined.
+    """A value with its standard error, which may be NaN for unknown.
 
     Attributes:
-        n: Number of values that it is the mean of; 0 if it is not a mean.
+        n: Number of values in the mean. 0 if the value is not a mean.
     """
 
     value: float
@@ -35,11 +35,11 @@ class Estimate:
         return self.value - self.error, self.value + self.error
 
     def as_json(self) -> dict[str, float]:
-        """The value as the mean that it usually is."""
+        """The value under the key "mean", with its error."""
         return {"mean": self.value, "error": self.error}
 
     def scaled(self, factor: float) -> Estimate:
-        """The same in another unit."""
+        """The estimate in another unit."""
         return Estimate(self.value * factor, self.error * factor, self.n)
 
 
@@ -71,12 +71,12 @@ class Rate:
 
     @property
     def value(self) -> float:
-        """The fraction; nan without trials."""
+        """The fraction of events, or nan without trials."""
         return self.n / self.n_trials if self.n_trials else math.nan
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Its 1 sigma interval, see :func:`jeffreys`."""
+        """The 1 sigma interval (see :func:`jeffreys`)."""
         return jeffreys(self.n, self.n_trials)
 
     def as_json(self) -> dict[str, Any]:
@@ -92,15 +92,15 @@ Estimated: TypeAlias = Estimate | Rate
 def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, float]:
     """The equal-tailed interval of a probability, with Jeffreys' prior.
 
-    Between the quantiles of the beta distribution with ``n + 1/2`` and ``n_trials - n + 1/2``. The
-    lower end is 0 without any event, and the upper end is 1 if every trial is one (Brown, Cai, DasGupta,
-    Statist. Sci. 16, 101, 2001).
+    The ends are quantiles of the beta distribution with ``n + 1/2`` and ``n_trials - n + 1/2``. The lower end
+    is 0 without events, and the upper end is 1 if every trial is an event (Brown, Cai, DasGupta, Statist.
+    Sci. 16, 101, 2001).
 
     Args:
         level: Probability of the interval, between 0 and 1.
 
     Returns:
-        Its lower and upper end; 0 and 1 without trials.
+        Lower and upper end. 0 and 1 without trials.
 
     Raises:
         ValueError: ``n`` is negative, or more than ``n_trials``.
@@ -112,7 +112,7 @@ def jeffreys(n: int, n_trials: int, level: float = ONE_SIGMA) -> tuple[float, fl
         [0.0, 0.0923]
     """
     if not 0 <= n <= n_trials:
-        raise ValueError(f"{n} of {n_trials}; expected at least 0, and at most all")
+        raise ValueError(f"{n} events in {n_trials} trials; expected at least 0 and at most all")
     if not n_trials:
         return 0.0, 1.0
     from scipy.special import betaincinv  # takes 0.3 s to import

@@ -1,4 +1,4 @@
-"""The grid of sites, the atoms on it, and the pattern that is wanted."""
+"""The grid of sites, the atoms on it, and the target pattern."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pydantic import Field, field_validator
 from labseq.settings import Frequency, Settings
 
 PAPERS_LOADING: Final = 0.75
-"""Fraction of the sites that hold an atom after loading, where nothing says it."""
+"""Default fraction of the sites that hold an atom after loading."""
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -38,10 +38,10 @@ class SiteGrid:
         lattice: "triangular" or "square".
         shear: +1 if rows shift to the right on the way down the image, -1 if to
             the left. The wrong sign makes 120 degrees out of 60.
-        row_frequency_hz: Frequency of the mobile tweezers' tone at each row,
-            float64 (n_rows,), equally spaced or by calibration.
+        row_frequency_hz: Frequency of the mobile tweezers' tone at each row, float64 (n_rows,), equally
+            spaced or from a calibration.
         column_frequency_hz: The same for each column, float64 (n_cols,).
-        positions_m: float64 (n_rows, n_cols, 2), (x, y) of each site; derived.
+        positions_m: float64 (n_rows, n_cols, 2), (x, y) of each site, derived from the others.
     """
 
     n_rows: int = 20
@@ -105,14 +105,14 @@ def centred_comb(n_sites: int, centre_hz: float = 100e6, step_hz: float = 1.6e6)
 
 
 class FrequencyComb(Settings):
-    """Tones of the rows or columns of the grid: equally spaced, or a table from a calibration."""
+    """Tones of the rows or columns of the grid, equally spaced or from a table of a calibration."""
 
     centre: Frequency = Field(default=100e6, gt=0, description="frequency of the grid's centre")
     step: Frequency = Field(
-        default=1.6e6, description="frequency from one row or column to the next; negative if it falls"
+        default=1.6e6, description="frequency step from one row or column to the next, negative if it falls"
     )
     table: tuple[Annotated[Frequency, Field(gt=0)], ...] = Field(
-        default=(), description="calibrated frequency of each row or column, in place of centre and step"
+        default=(), description="calibrated frequency of each row or column, instead of centre and step"
     )
 
     @field_validator("step")
@@ -127,7 +127,7 @@ class FrequencyComb(Settings):
     def _tones_in_order(cls, table: tuple[float, ...]) -> tuple[float, ...]:
         steps_hz = np.diff(table)
         if not (np.all(steps_hz > 0) or np.all(steps_hz < 0)):
-            raise ValueError("the tones neither rise nor fall all along; expected the sites' in order")
+            raise ValueError("the tones neither rise nor fall throughout; expected the sites' in order")
         return table
 
     def tones(self, n_sites: int) -> NDArray[np.float64]:
@@ -147,11 +147,11 @@ def axis_positions_m(n_sites: int, spacing_m: float) -> Floats:
 
 
 def mean_step_hz(site_hz: Floats, other_hz: Floats) -> float:
-    """Mean step from tone to tone of an axis, in Hz; of a single tone that of the other axis."""
+    """Mean step from tone to tone of an axis, in Hz. For a single tone, the step of the other axis."""
     for values in (site_hz, other_hz):
         if len(values) > 1:
             return float(values[-1] - values[0]) / (len(values) - 1)
-    return 1.6e6  # for a grid of one site: the step of the paper
+    return 1.6e6  # the paper's step, for a grid of one site
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,10 +160,10 @@ class TargetPattern:
 
     Attributes:
         fill: bool (n_rows, n_cols), sites that must hold an atom.
-        clear: bool (n_rows, n_cols), sites that must be empty. All others are
-            reservoir: an atom there does no harm.
-        name: For records and the screen.
-        regions: Named sets of sites, bool (n_rows, n_cols), that quantities refer to; they ask nothing.
+        clear: bool (n_rows, n_cols), sites that must be empty. All others are the reservoir, where atoms do
+            no harm.
+        name: Name in records and on the screen.
+        regions: Named sets of sites, bool (n_rows, n_cols), for quantities. They require nothing.
     """
 
     fill: NDArray[np.bool_]
@@ -190,7 +190,7 @@ class TargetPattern:
 
     @property
     def is_none(self) -> bool:
-        """Whether it asks nothing of any site."""
+        """Whether it requires nothing of any site."""
         return not (self.fill.any() or self.clear.any())
 
     @property
@@ -224,10 +224,10 @@ def as_occupancy(values: Any, shape: tuple[int, int] | None = None) -> Occupancy
         shape: The grid's (n_rows, n_cols), if it is known.
 
     Returns:
-        A C-contiguous bool array; the caller's own if it already is one.
+        A C-contiguous bool array, or ``values`` itself if it already is one.
 
     Raises:
-        ValueError: Not two-dimensional, of another shape, or other values than 0 and 1.
+        ValueError: The array is not two-dimensional, has another shape, or has values other than 0 and 1.
 
     Example:
         >>> as_occupancy([[1, 0], [0, 1]]).sum()
@@ -235,13 +235,13 @@ def as_occupancy(values: Any, shape: tuple[int, int] | None = None) -> Occupancy
     """
     array = np.asarray(values)
     if array.ndim != 2 or array.size == 0:
-        raise ValueError(f"an occupancy has shape (n_rows, n_cols); this one has {array.shape}")
+        raise ValueError(f"an occupancy must have shape (n_rows, n_cols), not {array.shape}")
     if shape is not None and array.shape != shape:
-        raise ValueError(f"the occupancy has shape {array.shape}; the grid has {shape}")
+        raise ValueError(f"the occupancy has shape {array.shape}, but the grid has {shape}")
     if array.dtype != np.bool_:
         as_bool = array.astype(np.bool_)
         if not np.array_equal(as_bool, array):
-            raise ValueError("an occupancy holds only 0 and 1 (False and True)")
+            raise ValueError("an occupancy may only contain 0 and 1 (False and True)")
         array = as_bool
     return np.ascontiguousarray(array)
 
@@ -249,18 +249,17 @@ def as_occupancy(values: Any, shape: tuple[int, int] | None = None) -> Occupancy
 def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) -> NDArray[Any]:
     """Make a read-only, C-contiguous array of a given dtype and shape.
 
-    A read-only array that already fits is returned as it is; anything else is
-    copied, so that the caller's array is neither frozen nor shared.
+    A read-only array that already fits is returned as it is. Anything else is copied, so that the caller's
+    array is neither frozen nor shared.
 
     Args:
         values: Array or nested sequence.
-        dtype: Wanted dtype; the conversion must not lose values.
-        shape: Wanted shape, where -1 stands for any length.
+        dtype: Required dtype. The conversion must not change values.
+        shape: Required shape. -1 means any length.
         name: Field name for the error message.
 
     Raises:
-        ValueError: Wrong number of dimensions, wrong shape, or values that the
-            dtype cannot hold.
+        ValueError: The shape is wrong, or the dtype cannot represent the values.
     """
     wanted = np.dtype(dtype)
     array: NDArray[Any] = np.asarray(values)
@@ -269,7 +268,7 @@ def read_only(values: Any, dtype: DTypeLike, shape: tuple[int, ...], name: str) 
         return array
     copy = array.astype(wanted, order="C")
     if array.dtype != wanted and not np.array_equal(copy, array):
-        raise ValueError(f"{name} holds values that {wanted} cannot represent")
+        raise ValueError(f"{name} has values that {wanted} cannot represent")
     if copy.size == 0 and 0 not in shape and copy.ndim != len(shape):  # [] for no rows of several columns
         copy = copy.reshape(tuple(0 if n == -1 else n for n in shape))
     if not _fits(copy.shape, shape):

@@ -1,7 +1,7 @@
-"""Quantities that the images of a shot have: survival, filling, loading; of all sites or of some.
+"""Quantities from the images of a shot, such as survival, filling and loading, for all sites or some.
 
-The name of such a quantity says all: "survival:before,after@target" is the survival of the target's atoms
-from the image `before` to the image `after`. It is the same in a sequence, on the command line and in Python.
+Their names include images and sites: "survival:before,after@target" is the survival of the target's atoms
+from the image `before` to the image `after`. Sequences, the command line and Python use the same names.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from labseq.model.grid import Occupancy, TargetPattern
 from labseq.model.records import CycleRecord, ImageRecord, follow_atoms, unique_names
 
 Events = tuple[float, float]
-"""A value and 1, or a number of events and the number of trials; 0 trials without a value."""
+"""A value and 1, or a number of events and the number of trials. Without a value there are 0 trials."""
 
 AtSites: TypeAlias = tuple[Occupancy, Occupancy]
-"""Sites where it happened, and where it could: an atom survived, there was one. bool (n_rows, n_cols)."""
+"""Sites with an event and sites with a trial, such as survivors and atoms, each bool (n_rows, n_cols)."""
 
 NO_VALUE: Final[Events] = (math.nan, 0.0)
 SITES: Final = "target, reservoir, ROWS,COLUMNS such as 2:8,3, or a name under 'regions' in the sequence"
-"""What may follow the "@" of a name."""
+"""The sites that may follow the "@" of a name."""
 
 
 class ImagesOfShot(Protocol):
-    """A shot with its images and what moved its atoms: one that was just taken, or a recorded one."""
+    """A new or recorded shot, with its images and rearrangement cycles."""
 
     @property
     def images(self) -> Sequence[ImageRecord]:
@@ -48,7 +48,7 @@ class QuantityName(NamedTuple):
     Attributes:
         kind: "survival", "filling", ..., or the whole name of a quantity without images.
         images: Names of images, or their indices.
-        sites: The sites that count: see :data:`SITES`; "" for all.
+        sites: The sites that count (see :data:`SITES`). "" for all.
     """
 
     kind: str
@@ -77,7 +77,7 @@ def mask_of(sites: str, target: TargetPattern) -> Occupancy:
     """The sites of a name, bool (n_rows, n_cols).
 
     Raises:
-        ValueError: They cannot be read, or there are none; says what was expected.
+        ValueError: ``sites`` cannot be read, or the grid has no such sites.
     """
     mask = np.zeros(target.shape, np.bool_)
     if sites == "":
@@ -91,7 +91,7 @@ def mask_of(sites: str, target: TargetPattern) -> Occupancy:
     elif match := re.fullmatch(r"(\d*)(:?)(\d*)\s*,\s*(\d*)(:?)(\d*)", sites):
         mask[_span(*match.groups()[:3]), _span(*match.groups()[3:])] = True
     else:
-        raise ValueError(f"'{sites}' names no sites")
+        raise ValueError(f"'{sites}' is not a set of sites")
     if not mask.any():
         n_rows, n_cols = target.shape
         why = "the run has no target" if target.is_none and sites == "target" else f"of {n_rows} x {n_cols}"
@@ -100,7 +100,7 @@ def mask_of(sites: str, target: TargetPattern) -> Occupancy:
 
 
 def _span(first: str, colon: str, end: str) -> slice:
-    """Rows or columns counted from 0: "3" is one, "2:8" are six, as in numpy."""
+    """Rows or columns, counted from 0 as in numpy, so "2:8" are the six from 2 to 7."""
     start = int(first or 0)
     if not colon:
         return slice(start, start + 1) if first else slice(0, 0)
@@ -111,7 +111,7 @@ def events_of(name: str, shot: ImagesOfShot, target: TargetPattern) -> Events:
     """A quantity of a shot's images.
 
     Args:
-        name: Its name, which has been checked.
+        name: Name of the quantity, already checked.
         shot: The shot.
         target: The target of the run.
     """
@@ -120,7 +120,7 @@ def events_of(name: str, shot: ImagesOfShot, target: TargetPattern) -> Events:
 
 
 def at_sites(name: str, shot: ImagesOfShot, target: TargetPattern) -> AtSites:
-    """A quantity of a shot's images at each site that counts; arguments as for :func:`events_of`."""
+    """A quantity of a shot's images at each site that counts, with the arguments of :func:`events_of`."""
     kind, images, sites = parse_name(name)
     mask = mask_of(sites, target)
     happened, tried = OF_IMAGES[kind].at_sites(shot, target, *images)
@@ -128,7 +128,7 @@ def at_sites(name: str, shot: ImagesOfShot, target: TargetPattern) -> AtSites:
 
 
 def find_image(shot: ImagesOfShot, name: str, default: int) -> ImageRecord | None:
-    """The image of a name, or of an index counted from 0; without a name, the default."""
+    """The image with a name or an index (counted from 0). Without a name, the default."""
     images = shot.images
     if not name:
         return images[default] if images else None
@@ -146,7 +146,7 @@ def _survival(shot: ImagesOfShot, target: TargetPattern, before: str = "", after
     first, last = find_image(shot, before, 0), find_image(shot, after, -1)
     if first is None or last is None or first.t_start_s >= last.t_start_s:
         return _nowhere(target)
-    # an image is taken at the end of its cycle, so that the cycle of the first image does not count
+    # an image is taken at the end of its cycle, so the cycle of the first image does not count
     start, end = (first.step, first.cycle), (last.step, last.cycle)
     cycles = (cycle for cycle in shot.cycles if start < (cycle.step, cycle.cycle) <= end)
     expected = np.logical_or(*follow_atoms(first.occupancy, cycles))
@@ -178,10 +178,10 @@ class ImageQuantity:
     Attributes:
         about: Its description.
         n_images: Number of images that its name may give.
-        is_rate: Whether it counts events in trials: shots are then added up.
+        is_rate: Whether it counts events in trials, so that shots are added up.
         needs_target: Whether it has no value in a run without a target.
-        at_sites: Its value at each site: takes a shot, the target and the names of the images.
-        sum_up: The value of a shot from the numbers of sites where it happened and where it could.
+        at_sites: Function of a shot, the target and the names of the images for the value at each site.
+        sum_up: The value of a shot from its numbers of events and of trials.
     """
 
     about: str
@@ -199,7 +199,7 @@ class ImageQuantity:
 
 OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
     "survival": ImageQuantity(
-        "atoms of an image that a later one still shows, at the sites to which they were moved; "
+        "share of the atoms in one image that a later image shows, at the sites to which they were moved; "
         "by default from the first image to the last",
         n_images=2,
         is_rate=True,
@@ -236,11 +236,11 @@ OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
 
 
 class StepSummary(NamedTuple):
-    """What a step of a shot means for its images.
+    """Whether a step takes an image or loads atoms.
 
     Attributes:
-        name: Its name.
-        takes_image: Whether it takes one.
+        name: Name of the step.
+        takes_image: Whether it takes an image.
         loads: Whether it loads atoms.
     """
 
@@ -250,7 +250,7 @@ class StepSummary(NamedTuple):
 
 
 def measured_by_default(steps: Sequence[StepSummary], *, has_target: bool) -> tuple[str, ...]:
-    """What a run without ``measure`` is about: its array, or without a target the survival of its atoms.
+    """Quantities of a run without ``measure``: filling with a target, or else the survival of the atoms.
 
     Example:
         >>> steps = [("load", False, True), ("a", True, False), ("wait", False, False), ("b", True, False)]
@@ -273,6 +273,6 @@ def measured_in(resolved: Mapping[str, Any]) -> tuple[str, ...]:
     """Names of the quantities that a run measures, the most important first.
 
     Args:
-        resolved: The settings of the run, as its record has them; none in runs of earlier versions.
+        resolved: The settings of the run from its record, which is empty in runs of earlier versions.
     """
     return tuple(one["value"] for one in resolved.get("measure", ()))

@@ -1,4 +1,4 @@
-"""Digital lines, which switch light and send triggers."""
+"""Digital lines that switch light and send triggers."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from labseq.model.grid import read_only
 from labseq.settings import IN_SI, Duration, OwnName, Text, setting_error
 
 IDLE: Final = "idle"
-"""The kind of the time between steps, and before and after a shot."""
+"""Kind of step for the time between steps and between shots."""
 
 
 Span: TypeAlias = tuple[float, float]
-"""From one time to another, in seconds."""
+"""Start and end, in seconds."""
 
 Pulses: TypeAlias = Mapping[str, Sequence[Span]]
-"""Line -> when it is on, from the beginning of a step."""
+"""Line -> times when it is on, from the beginning of a step."""
 
 NO_PULSES: Final[Pulses] = {}
 
@@ -50,13 +50,13 @@ class LineSpec:
     name: OwnName
     channel: Annotated[
         Channel,
-        Field(description="output of the timing box: its number, or its name such as `Dev1/port0/line3`"),
+        Field(description="number of the output on the timing box, or a name such as `Dev1/port0/line3`"),
     ]
     on: Annotated[
         tuple[Text, ...],
         Field(
             description="kinds of step during which it is on: `load`, `image`, `rearrange`, `ramp`, "
-            "`release`, `pulse`, `wait`; `idle`: between steps, and before and after a shot"
+            "`release`, `pulse`, `wait`, and `idle` for the time between steps and between shots"
         ),
     ] = ()
     lead_s: Annotated[Duration, Field(description="how long before such a step it is turned on")] = 0.0
@@ -72,19 +72,19 @@ class LineSpec:
     triggers: Annotated[
         Literal["", "camera", "mobile_tweezers"],
         Field(
-            description="the role whose trigger input it is wired to: its exposures or moves begin with the "
+            description="the role whose trigger input it is wired to. Its exposures or moves begin with the "
             "line"
         ),
     ] = ""
     blinding: Annotated[
-        bool, Field(description="its light would harm a camera with EM gain: never on during an exposure")
+        bool, Field(description="its light would damage a camera with EM gain and is never on in an exposure")
     ] = False
     active_low: Annotated[bool, Field(description="the output is low while the line is on")] = False
     turns_off: Annotated[
         Literal["", "static_tweezers"],
         Field(
-            description="the role whose light is off while the line is on; with `static_tweezers` the step "
-            "`release` is timed by the box, and the line is on in no other"
+            description="the role whose light is off while the line is on. With `static_tweezers` the box "
+            "times the step `release`, and the line is on in no other step"
         ),
     ] = ""
 
@@ -96,32 +96,32 @@ class LineSpec:
         extra = next((key for key in ("lead", "lag", "pulse") if getattr(self, f"{key}_s")), "")
         if self.turns_off and extra:
             what = f"{extra} is set for a line that turns the static tweezers off"
-            raise setting_error(what, "none: it is on as long as the release", at=(extra,), key=True)
+            raise setting_error(what, "none, as it is on as long as the release", at=(extra,), key=True)
         if self.pulse_s and self.lag_s:
             raise setting_error(
-                "lag is set beside pulse", "one of the two: a pulse ends by itself", at=("lag",), key=True
+                "both lag and pulse are set", "one of them, as a pulse ends by itself", at=("lag",), key=True
             )
         if self.pulse_s and IDLE in self.on:
             raise setting_error(
-                "a pulse has 'idle' among its steps", "kinds of step, which have a beginning", at=("on",)
+                "a pulse has 'idle' among its steps", "kinds of step with a beginning", at=("on",)
             )
         if self.triggers and set(self.on) != {kind := _TRIGGERED[self.triggers]}:
             what = f"a line that triggers the {self.triggers.replace('_', ' ')} is on at other times"
             raise setting_error(what, f"`on: [{kind}]`", at=("on",))
         if self.triggers and self.lead_s:
             raise setting_error(
-                "lead is set for a trigger", "none: the step begins with it", at=("lead",), key=True
+                "lead is set for a trigger", "none, as the step begins with it", at=("lead",), key=True
             )
         return self
 
 
 def lines_of(specs: Iterable[LineSpec], kind: str) -> list[LineSpec]:
-    """The lines that a kind of step turns on; none for idle, which has no leads and lags."""
+    """The lines that a kind of step turns on. None for idle, which has no leads and lags."""
     return [spec for spec in specs if kind in spec.on and kind != IDLE]
 
 
 def margin_s(specs: Iterable[LineSpec], kind: str) -> float:
-    """Time by which the leads and lags of its lines prolong a step, in seconds."""
+    """Time that leads and lags of lines add to a step, in seconds."""
     taking_part = lines_of(specs, kind)
     lead_s = max((spec.lead_s for spec in taking_part), default=0.0)
     return lead_s + max((spec.lag_s for spec in taking_part if not spec.pulse_s), default=0.0)
@@ -132,11 +132,11 @@ class LinesFacts:
     """Facts about a timing box that are known before it is opened.
 
     Attributes:
-        channels: Its outputs, as ``LineSpec.channel`` names them; empty if not known before it is open.
-        resolution_s: Step of its clock: edges fall on multiples of it.
-        shortest_s: Least time between two edges.
-        max_edges: Most edges of a program.
-        latency_s: From the call of ``fire`` to the first edge.
+        channels: Its outputs, as in ``LineSpec.channel``. Empty if not known before it is open.
+        resolution_s: Step of its clock. Edges are at multiples of it.
+        shortest_s: Shortest time between two edges.
+        max_edges: Maximum number of edges in a program.
+        latency_s: Time from the call of ``fire`` to the first edge.
     """
 
     channels: tuple[int | str, ...]
@@ -151,12 +151,12 @@ class LineProgram:
     """The states of all lines during one step.
 
     Attributes:
-        kind: Kind of the step, "image".
-        lines: Their names, n_lines of them.
-        t_s: float64 (n_edges,), times of the edges from the firing on, in seconds, rising from 0.
-        on: bool (n_edges, n_lines), the state from each edge on; the last one stays.
+        kind: Kind of the step, such as "image".
+        lines: Names of the n_lines lines.
+        t_s: float64 (n_edges,), times of the edges after the firing, in seconds, rising from 0.
+        on: bool (n_edges, n_lines), the states after each edge. The last states stay.
         begin_s: When the step itself begins, after all leads.
-        duration_s: When all is over, lags included; the last edge is not later.
+        duration_s: End of the program, lags included. The last edge is not later.
     """
 
     kind: str
@@ -170,7 +170,7 @@ class LineProgram:
         t_s = read_only(np.asarray(self.t_s, np.float64), np.float64, (-1,), "t_s")
         on = read_only(np.asarray(self.on, np.bool_), np.bool_, (len(t_s), len(self.lines)), "on")
         if len(t_s) == 0 or t_s[0] != 0.0 or not (np.diff(t_s) > 0).all():
-            raise ValueError("the edges of a line program begin at 0 and rise")
+            raise ValueError("the edges of a line program must begin at 0 and rise")
         object.__setattr__(self, "t_s", t_s)
         object.__setattr__(self, "on", on)
 
@@ -190,9 +190,9 @@ class LineProgram:
         return spans
 
     def changes(self) -> list[tuple[str, bool, float]]:
-        """Line, whether it is on from then on, and time of each change, line by line.
+        """Line, new state and time of each change, line by line.
 
-        The lines are idle before the program, as at its end.
+        Before the program the lines are in their state at its end.
         """
         changed = self.on != np.vstack([self.on[-1:], self.on[:-1]])
         columns, edges = np.nonzero(changed.T)
@@ -202,5 +202,5 @@ class LineProgram:
         ]
 
     def rising(self, line: str) -> list[float]:
-        """Times at which a line switches on, in seconds from the start of the program; 0 if it starts on."""
+        """Times at which a line switches on, in seconds from the start of the program. 0 if it starts on."""
         return [start for start, _ in self.spans(line)]

@@ -29,7 +29,7 @@ SpeedProfile = Literal["constant", "minimum_jerk", "constant_jerk"]
 PhaseChoice = Literal["random", "low_crest"]
 
 LOAD_OHM = 50.0
-"""Load of an output in ohms; full scale is the voltage across it."""
+"""Load of an output, in ohms. Full scale is the voltage across it."""
 
 
 def _rises(band: tuple[float, float]) -> tuple[float, float]:
@@ -48,9 +48,9 @@ Amplitudes: TypeAlias = tuple[Annotated[Fraction, Field(gt=0)], ...]
 class RfSpec:
     """The RF drive of the mobile tweezers' AODs, and its limits.
 
-    Random phases and amplitudes preassigned per tone are the paper's ("RF
-    intermodulation"). All numbers are ours, because the paper is silent. Amplifiers of this kind
-    die above 2 V at their input.
+    Random phases and preassigned amplitudes for each tone are as in the paper ("RF intermodulation"). The
+    paper states no numbers, so all of them are ours. More than 2 V at the input destroys amplifiers of this
+    kind.
     """
 
     row_band_hz: Annotated[Band, Field(description="[lowest, highest] frequency of the row axis' AOD")] = (
@@ -66,22 +66,22 @@ class RfSpec:
     row_amplitudes: Annotated[
         Amplitudes,
         Field(
-            description="amplitude of each row's tone, as a fraction of full scale; none: all equal, such "
-            "that `max_row_tones` reach full scale together"
+            description="amplitude of each row's tone, as a fraction of full scale. By default all are "
+            "equal, and `max_row_tones` of them reach full scale together"
         ),
     ] = ()
     column_amplitudes: Annotated[
         Amplitudes,
         Field(
-            description="amplitude of each column's tone, as a fraction of full scale; none: all equal, such "
-            "that `max_column_tones` reach full scale together"
+            description="amplitude of each column's tone, as a fraction of full scale. By default all are "
+            "equal, and `max_column_tones` of them reach full scale together"
         ),
     ] = ()
     phases: Annotated[
         PhaseChoice,
         Field(
-            description="phases of the tones at pick-up: random, but always the same for a site, or chosen "
-            "for each batch so that the tones' sum has a low crest"  # by Schroeder's rule
+            description="phases of the tones at pick-up: random but fixed for each site, or chosen "
+            "for each batch so that the sum of the tones has a low crest"  # by Schroeder's rule
         ),
     ] = "random"
     phase_seed: Annotated[int, Field(ge=0, description="seed of the random phases")] = 20220711
@@ -100,7 +100,7 @@ class RfSpec:
         Field(
             ge=0,
             description="distance in the atom plane within which calibrated tones are moved to an equally "
-            "spaced comb; 0: none is moved",
+            "spaced comb. 0 moves no tone",
         ),
     ] = 20e-9
 
@@ -115,26 +115,26 @@ Loss: TypeAlias = Annotated[Fraction, Field(lt=1)]
 
 @settings(frozen=True, slots=True, config=IN_SI)
 class LossSpec:
-    """How probably atoms are lost, to compare plans by what survives; nothing is lost because of it."""
+    """Loss probabilities of atoms, by which plans are compared. They cause no losses themselves."""
 
     # About the paper's filling after one cycle (derived).
     move: Annotated[Loss, Field(description="loss of an atom that is picked up, moved and dropped off")] = (
         0.0188
     )
-    tone: Annotated[Loss, Field(description="added to it for each tone on beyond one per axis")] = 0.0
-    distance_per_m: Annotated[float, Field(ge=0, description="added to it per metre of the way")] = 0.0
-    # Ours: at the paper's depths 99.6 % or more in the simulation, however slowly the tweezer comes.
+    tone: Annotated[Loss, Field(description="further loss for each tone beyond one per axis")] = 0.0
+    distance_per_m: Annotated[float, Field(ge=0, description="further loss per metre of the path")] = 0.0
+    # Ours. At the paper's depths it is 99.6 % or more in the simulation, however slow the tweezer is.
     landing: Annotated[
         Loss,
-        Field(description="loss of an atom that stands where a tweezer without an atom is ramped down"),
+        Field(description="loss of an atom on a site where a tweezer without an atom is ramped down"),
     ] = 0.99
-    # Ours: simulated for the paper's depths and waists at 15 uK.
+    # Ours, simulated for the paper's depths and waists at 15 uK.
     passing: Annotated[
         Loss,
         Field(
             description="loss of an atom that a tweezer of full depth passes at 1.944 um, as in a straight "
-            "lane of the paper's lattice; a factor e less for each further 0.12 um, and less in shallower "
-            "tweezers, see `path_depth`; the tweezer's own atom is then lost too"
+            "lane of the paper's lattice. The loss falls by a factor e for each further 0.12 um, and in "
+            "shallower tweezers (see `path_depth`). With the atom, the tweezer's own atom is lost too"
         ),
     ] = 0.0022
     spread: Annotated[
@@ -142,8 +142,8 @@ class LossSpec:
         Field(
             ge=0,
             le=5,
-            description="spread of these losses from shot to shot: s.d. of the logarithm of a log-normal "
-            "factor with mean 1",
+            description="spread of these losses from shot to shot, as the standard deviation of the "
+            "logarithm of a log-normal factor with mean 1",
         ),
     ] = 0.5
     # The paper's, 0.45 %.
@@ -162,11 +162,11 @@ Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
 
 @settings(frozen=True, slots=True, config=IN_SI)
 class MotionSpec:
-    """How the mobile tweezers move, for every driver: ramps, speed, overheads and limits.
+    """Motion of the mobile tweezers for every driver: ramps, speed, overheads and limits.
 
-    Ramps and speed are the paper's ("Experimental Setup"). The overhead of a cycle is ours:
-    the paper's cycle time of x1.8 over ten cycles leaves about 13 ms per later cycle
-    beside the exposure; it is not spent on an empty plan.
+    Ramps and speed are the paper's ("Experimental Setup"). The overhead of a cycle is ours, because the
+    paper's cycle time of x1.8 over ten cycles leaves about 13 ms per later cycle in addition to the exposure.
+    An empty plan has no overhead.
     """
 
     pick_up_s: Annotated[Duration, Field(description="duration of the pick-up ramp, linear in depth")] = 60e-6
@@ -177,22 +177,22 @@ class MotionSpec:
     speed_profile: Annotated[
         SpeedProfile,
         Field(
-            description="course of the speed during a transport; `speed` is the mean on the longest way of a "
-            "batch, and with a course other than constant all atoms of a batch start and arrive together"
+            description="speed over time during a transport. `speed` is the mean on the longest path of a "
+            "batch. Unless the speed is constant, all atoms of a batch start and arrive together"
         ),
     ] = "constant"
     overhead_per_batch_s: Annotated[
         Duration,
         Field(
-            description="time that passes before each batch, tweezers off; only of `use: virtual`, as a "
+            description="time before each batch with the tweezers off, only for `use: virtual` as a "
             "model of another setup"
         ),
     ] = 0.0
     overhead_per_cycle_s: Annotated[
         Duration,
         Field(
-            description="time that passes before the first batch of a cycle; left out: what is typical of "
-            "the driver and its mode, if it says so; a calibration of the kind `timing` takes precedence"
+            description="time before the first batch of a cycle. The default is the typical value of the "
+            "driver and its mode, if known. A calibration of the kind `timing` takes precedence"
         ),
     ] = 13e-3
     max_tweezers: Annotated[Sites, Field(description="largest number of mobile tweezers on at once")] = 20
@@ -204,29 +204,29 @@ class MotionSpec:
         int,
         Field(ge=0, le=100, description="how many sites beyond the grid the tones reach, on each side"),
     ] = 1
-    # Half-way between two rows of the paper's lattice it is 1.944 um; how many atoms are lost there depends
-    # on their temperature (ours).
+    # Half-way between two rows of the paper's lattice the distance is 1.944 um. The losses there depend on
+    # the atoms' temperature (ours).
     clearance_m: Annotated[
         Length,
         Field(
             gt=0,
             le=1e-3,
-            description="least distance of a moving tweezer from atoms that stand, and of neighbouring lines "
-            "of tweezers, where rows and columns move at once",
+            description="least distance of a moving tweezer from resting atoms, and between neighbouring "
+            "lines of tweezers, if rows and columns move at once",
         ),
     ] = 1.9e-6
     path_depth: Annotated[
         Fraction,
         Field(
             gt=0,
-            description="depth of the tweezers where rows and columns move at once, as a fraction of the "
-            "full depth: shallower ones take fewer of the atoms that they pass",
+            description="depth of the tweezers if rows and columns move at once, as a fraction of the "
+            "full depth. Shallower tweezers remove fewer of the atoms that they pass",
         ),
     ] = 1.0
     empty_tweezers_may_land: Annotated[
         bool,
         Field(
-            description="whether a tweezer without an atom may end on a site that holds one, where rows and "
+            description="whether a tweezer without an atom may end on a site with an atom, if rows and "
             "columns move at once"
         ),
     ] = False
@@ -234,19 +234,19 @@ class MotionSpec:
         RfSpec()
     )
     losses: Annotated[
-        LossSpec, empty_is({}), Field(description="losses of atoms that plans are compared by")
+        LossSpec, empty_is({}), Field(description="losses of atoms, by which plans are compared")
     ] = LossSpec()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RfSamples:
-    """Samples that an output played without interruption.
+    """Samples that an output played without a gap.
 
     Attributes:
         start_s: When the first sample was at the output, on the session's clock.
         sample_rate_hz: Samples per second.
         samples: int16 (n,).
-        volts_per_step: Volts into 50 Ohm that a sample of 1 stands for.
+        volts_per_step: Voltage into 50 Ohm of a sample of 1.
     """
 
     start_s: float
@@ -262,7 +262,7 @@ class RfSamples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RfTones:
-    """Tones that an output generated itself, without interruption.
+    """Tones that an output generated itself, without a gap.
 
     At the time t after the start, tone i is
     ``(amplitude_v + amplitude_slope t) cos(phase_rad + 2 pi (frequency_hz t + frequency_slope t^2 / 2))``.
@@ -293,4 +293,4 @@ class RfTones:
 
 
 RfSpan: TypeAlias = RfSamples | RfTones
-"""A part of an output; between two of them it is silent."""
+"""A part of an output without a gap. The output is silent between parts."""

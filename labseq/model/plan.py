@@ -14,23 +14,23 @@ from labseq.model.grid import read_only
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TonePaths:
-    """Where the tones of a batch go, and where each is ramped down.
+    """Paths of the tones of a batch, and the knots at which tones are ramped down.
 
-    All tones are ramped up at knot 0. From one knot to the next each tone goes straight, and all have
-    made the same fraction of their ways at any time. Positions are in sites, counted as rows and columns
-    are; a *lane* is at a fraction, between two rows or columns. At a knot where tones are ramped down,
-    the others stand and wait.
+    All tones are ramped up at knot 0. From one knot to the next each tone goes straight, and at any time all
+    have covered the same fraction of their paths. Positions are in sites, with the numbers of rows and
+    columns. A *lane* has a fractional position between two rows or columns. At a knot where tones are ramped
+    down, the others wait.
 
     Attributes:
-        row: float64 (n_knots, n_row_tones), position of each row tone at each knot, at least two knots.
+        row: float64 (n_knots, n_row_tones), position of each row tone at each of at least two knots.
         column: float64 (n_knots, n_column_tones), the same for the column tones.
-        row_off: int32 (n_row_tones,), the knot at which each row tone is ramped down; by default the last.
-        column_off: int32 (n_column_tones,), the same for the column tones. Some tone of either axis
-            stays on until the last knot.
+        row_off: int32 (n_row_tones,), the knot at which each row tone is ramped down, by default the last.
+        column_off: int32 (n_column_tones,), the same for the column tones. In both axes at least one tone
+            must stay on until the last knot.
 
     Raises:
-        ValueError: Positions that are not finite, fewer than two knots, an axis without tones, or
-            tones that all go off before the last knot, or at knot 0, or after the last.
+        ValueError: A position is not finite, there are fewer than two knots, an axis has no tones, a tone
+            goes off at knot 0 or after the last knot, or no tone stays on until the last knot.
 
     Example:
         >>> paths = TonePaths([[0.0, 2.0], [0.5, 2.5]], [[3.0], [3.0]])
@@ -47,7 +47,7 @@ class TonePaths:
         row = read_only(self.row, np.float64, (-1, -1), "row")
         column = read_only(self.column, np.float64, (len(row), -1), "column")
         if len(row) < 2 or not row.shape[1] or not column.shape[1]:
-            raise ValueError(f"paths have two knots and one tone of each axis at least, not {self._text()}")
+            raise ValueError(f"paths need at least two knots and one tone of each axis, not {self._text()}")
         if not (np.isfinite(row).all() and np.isfinite(column).all()):
             raise ValueError("a position of a tone is not finite")
         object.__setattr__(self, "row", row)
@@ -59,7 +59,7 @@ class TonePaths:
             off = read_only(given if len(given) else np.full(n_tones, last), np.int32, (n_tones,), name)
             if off.min() < 1 or off.max() != last:
                 raise ValueError(
-                    f"{name} holds knots from 1 to the last, {last}, and at least one is the last"
+                    f"{name} must have knots from 1 to the last, {last}, and at least one must be the last"
                 )
             object.__setattr__(self, name, off)
 
@@ -78,7 +78,7 @@ class TonePaths:
             sites: (n, 2), (row, col) of each.
 
         Returns:
-            int (n, 2), row tone and column tone of each; -1 where none starts there.
+            int (n, 2), row tone and column tone of each site, -1 if no tone starts there.
         """
         wanted = np.asarray(sites).reshape(-1, 2)
         tones = np.full(wanted.shape, -1)
@@ -97,20 +97,19 @@ class TonePaths:
 class Batch:
     """Atom moves that are carried out at the same time.
 
-    Without ``tones`` it is a *line batch*: each atom goes straight along its row or column, all of them
-    along the same axis, at one speed. With ``tones`` the tones of both axes take any paths; every
-    crossing of theirs that starts on an atom must be named.
+    Without ``tones`` it is a *line batch*, in which all atoms go straight along the same axis at one speed.
+    With ``tones`` the tones of both axes can take any paths. The moves must then include every crossing that
+    starts on an atom.
 
     Attributes:
         from_sites: int16 (n, 2), (row, col) of each atom before.
-        to_sites: int16 (n, 2), (row, col) of each atom after; a site outside the
-            grid ejects the atom.
-        linked: Whether the tweezers stay on from the batch before, so that there
-            is no drop-off and pick-up between the two. Only line batches are linked.
-        tones: The paths of the tones; None for a line batch.
+        to_sites: int16 (n, 2), (row, col) of each atom after. A site outside the grid ejects the atom.
+        linked: Whether the tweezers stay on from the batch before, without drop-off and pick-up in
+            between. Only line batches can be linked.
+        tones: The paths of the tones. None for a line batch.
 
     Example:
-        Two atoms of row 0 go to row 2, each to another column, between the columns on the way.
+        Two atoms of row 0 go to row 2 along lanes between columns, each to another column.
 
         >>> paths = TonePaths(
         ...     row=[[0.0], [0.5], [1.5], [2.0]],
@@ -131,7 +130,7 @@ class Batch:
         to_sites = read_only(self.to_sites, np.int16, (len(from_sites), 2), "to_sites")
         object.__setattr__(self, "to_sites", to_sites)
         if self.linked and self.tones is not None:
-            raise ValueError("only line batches are linked; paths of tones have any number of knots instead")
+            raise ValueError("only line batches can be linked; use one batch with more knots instead")
 
     def __len__(self) -> int:
         return len(self.from_sites)
@@ -144,18 +143,18 @@ NO_KNOTS: Final[NDArray[np.int32]] = read_only([], np.int32, (-1,), "path_off")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """Batches in order, held as flat arrays.
+    """Batches in order, stored as flat arrays.
 
-    Predicted occupancy and duration are worked out by :func:`labseq.check_plan`,
-    never by the planner. What the arrays say of paths is tested there, too.
+    :func:`labseq.check_plan` computes predicted occupancy and duration, never the planner. It also checks the
+    paths.
 
     Attributes:
         moves: int16 (n_atom_moves, 4), (from row, from col, to row, to col).
-        batch_offsets: int32 (n_batches + 1,); batch i is ``moves[o[i]:o[i + 1]]``.
+        batch_offsets: int32 (n_batches + 1,). Batch i is ``moves[o[i]:o[i + 1]]``.
         linked: bool (n_batches,), see :class:`Batch`.
-        path_shapes: int32 (n_batches, 3), numbers of knots, row tones and column tones of each batch,
-            0 for a line batch; (0, 3) for a plan of line batches alone.
-        path_positions: float64, for each batch with paths ``row.ravel()``, then ``column.ravel()``, see
+        path_shapes: int32 (n_batches, 3), numbers of knots, row tones and column tones of each batch. They
+            are 0 for a line batch. A plan with only line batches has shape (0, 3).
+        path_positions: float64, for each batch with paths ``row.ravel()``, then ``column.ravel()`` of
             :class:`TonePaths`.
         path_off: int32, for each batch with paths ``row_off``, then ``column_off``.
     """
@@ -191,11 +190,11 @@ class Plan:
         positions = read_only(self.path_positions, np.float64, (-1,), "path_positions")
         off = read_only(self.path_off, np.int32, (-1,), "path_off")
         if len(shapes) not in (0, n_batches):
-            raise ValueError(f"path_shapes has {len(shapes)} rows; the plan has {n_batches} batches")
+            raise ValueError(f"path_shapes has {len(shapes)} rows, but the plan has {n_batches} batches")
         stop, off_stop = _path_ends(shapes)
         if (shapes < 0).any() or (len(positions), len(off)) != (stop, off_stop):
             given = f"{len(positions)} and {len(off)} are given"
-            raise ValueError(f"path_shapes asks for {stop} positions and {off_stop} knots; {given}")
+            raise ValueError(f"path_shapes requires {stop} positions and {off_stop} knots, but {given}")
         object.__setattr__(self, "path_shapes", shapes if shapes.any() else NO_SHAPES)
         object.__setattr__(self, "path_positions", positions)
         object.__setattr__(self, "path_off", off)
@@ -244,7 +243,7 @@ class Plan:
         return len(self.path_positions) > 0
 
     def paths(self, index: int) -> TonePaths | None:
-        """Paths of the tones of one batch, as views of the flat arrays; None for a line batch."""
+        """Paths of the tones of one batch, as views of the flat arrays, or None for a line batch."""
         if not len(self.path_shapes) or not self.path_shapes[index].any():
             return None
         start, off_start = _path_ends(self.path_shapes[:index])
@@ -261,7 +260,7 @@ class Plan:
         return self.part(0, n_batches)
 
     def part(self, start: int, stop: int) -> Plan:
-        """Batches ``start`` to ``stop - 1``; a chain of linked batches must not be cut."""
+        """Batches ``start`` to ``stop - 1``, which must not cut a chain of linked batches."""
         offsets = self.batch_offsets[start : stop + 1]
         batches = self.moves[offsets[0] : offsets[-1]], offsets - offsets[0], self.linked[start:stop]
         if not self.has_paths:
@@ -279,10 +278,10 @@ class PlanReport:
         predicted: bool (n_rows, n_cols), occupancy after the plan if no atom is lost.
         batch_end_s: float64 (n_batches,), time from the start of the cycle to the
             end of each batch, overheads included.
-        n_tweezers: int32 (n_batches,), mobile tweezers on in each batch, crossings
-            that carry no atom included.
-        n_defects: Empty target sites after the plan.
-        n_surplus: Atoms left on sites that must be empty.
+        n_tweezers: int32 (n_batches,), number of mobile tweezers on in each batch, including crossings
+            without an atom.
+        n_defects: Number of empty target sites after the plan.
+        n_surplus: Number of atoms left on sites that must be empty.
     """
 
     predicted: NDArray[np.bool_]
@@ -298,7 +297,7 @@ class PlanReport:
 
     @property
     def meets_target(self) -> bool:
-        """Whether the plan, if no atom is lost, ends with the target exactly met."""
+        """Whether the plan meets the target exactly if no atom is lost."""
         return self.n_defects == 0 and self.n_surplus == 0
 
 
@@ -308,7 +307,7 @@ def _sites(values: ArrayLike) -> NDArray[Any]:
 
 
 def _path_ends(shapes: NDArray[np.int32]) -> tuple[int, int]:
-    """How many positions and how many knots of :class:`Plan` belong to the given batches."""
+    """Numbers of positions and of knots in :class:`Plan` for the given batches."""
     if not len(shapes):
         return 0, 0
     n_tones = shapes[:, 1].astype(np.int64) + shapes[:, 2]

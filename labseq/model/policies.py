@@ -1,4 +1,4 @@
-"""Policies of a run: how long calls may take, light that must be off, and reactions to failures."""
+"""Policies of a run: timeouts of calls, light that must be off, and reactions to failures."""
 
 from __future__ import annotations
 
@@ -67,28 +67,28 @@ WhenExhausted: TypeAlias = Literal["skip_point", "stop"]
 
 @settings(frozen=True, slots=True, config=IN_SI)
 class StepPolicy:
-    """``policy`` of a step, in place of the run's policy."""
+    """``policy`` of a step, which replaces the run's policy."""
 
     timeout_s: Annotated[
         PositiveDuration | None,
-        Field(description="longest duration of an attempt at the step; a longer one has failed"),
+        Field(description="longest duration of an attempt at the step, after which it has failed"),
     ] = None
     retries: Annotated[
         int,
         Field(
             ge=0,
             le=100,
-            description="how often the step is repeated, in the same shot, before it counts as failed; for "
-            "steps that do not move atoms",
+            description="how often the step is repeated, in the same shot, before it counts as failed. Only "
+            "for steps that do not move atoms",
         ),
     ] = 0
     on_failure: Annotated[
-        Then | None, Field(description="reaction to its failure; none: that of the run's policy")
+        Then | None, Field(description="reaction to its failure, by default as in the run's policy")
     ] = None
     over_budget: Annotated[
         OverBudget | None,
         Field(
-            description="reaction to a stage of it that takes longer than its budget; none: that of the "
+            description="reaction to a stage of it that takes longer than its budget, by default as in the "
             "run's policy"
         ),
     ] = None
@@ -100,7 +100,7 @@ class StepPolicy:
 
 
 NO_POLICY: Final = StepPolicy()
-"""The policy of what has none of its own; one object, because checking a new one takes 10 us."""
+"""The policy of steps without their own. A single object, because validating a new one takes 10 us."""
 
 _ENDING: Final = (
     StopRequested,
@@ -111,7 +111,7 @@ _ENDING: Final = (
     PluginLoadError,
     UnknownPluginError,
 )
-"""Failures that end the run whatever the policy: the operator asks for it, a person must look at the
+"""Failures that end the run whatever the policy, because the operator asks for it, a person must look at the
 machine, or a repetition would fail again."""
 
 
@@ -132,7 +132,7 @@ class RunPolicy:
     steps: Sequence[StepPolicy] = ()
 
     def of_step(self, number: int | None) -> StepPolicy:
-        """The policy of a step; None: outside of all steps."""
+        """The policy of a step, or for None the policy outside of all steps."""
         if number is None or number >= len(self.steps):
             return self.otherwise
         return self.steps[number]
@@ -141,12 +141,14 @@ class RunPolicy:
         """The reaction to a failure.
 
         Args:
-            step: Index of the step that failed; None outside of all steps.
+            step: Index of the step that failed. None outside of all steps.
             attempt: Number of the attempt at the shot, from 0.
         """
         if isinstance(error, _ENDING):
             return "stop"
-        if isinstance(error, ShotAbortedError):  # the leader decides how often; the machine has not failed
+        if isinstance(
+            error, ShotAbortedError
+        ):  # the leader decides how often, and the machine has not failed
             return "repeat_shot"
         then = error.then if isinstance(error, OverBudgetError) else self.of_step(step).on_failure
         if then is None:

@@ -1,4 +1,4 @@
-"""What happened in a run, a shot, an image and a cycle; the timeline planned beforehand."""
+"""Records of runs, shots, images and cycles, and the planned timeline of a shot."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ ShotStatus = Literal["complete", "interrupted", "failed"]
 RunStatus = Literal["running", "complete", "stopped", "failed"]
 
 OVERSHOOT_S: Final = 1e-3
-"""What a real clock may overshoot a wait by, in seconds."""
+"""Longest time by which a wait on a real clock may be late, in seconds."""
 
 STEP: Final = "step_"
 """Prefix of the stage of a whole step: "step_2_rearrange"."""
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """The names of steps; those that occur more than once with the index of the step.
+    """The names of steps. Names that occur more than once also get the index of the step.
 
     Example:
         >>> unique_names(["load", "image", "rearrange", "image"])
@@ -45,11 +45,11 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class TimedBy:
-    """What times a step, and how well.
+    """The clock of a step, and its accuracy.
 
     Attributes:
-        name: "computer", or the role of the hardware: "lines", "camera".
-        accuracy_s: Resolution of the hardware, or how late the computer may be, in seconds; 0: unknown.
+        name: "computer", or the role of the hardware, such as "lines" or "camera".
+        accuracy_s: Resolution of the hardware, or how late the computer may be, in seconds. 0 if unknown.
     """
 
     name: str
@@ -57,22 +57,22 @@ class TimedBy:
 
 
 COMPUTER: Final = TimedBy("computer", OVERSHOOT_S)
-"""The computer's own clock: steps on it follow one another typically 0.4 ms late (measured)."""
+"""The computer's own clock. Steps on it are typically 0.4 ms late after one another (measured)."""
 
 
 @dataclass(frozen=True, slots=True)
 class StageTiming:
-    """How long one stage took, against its budget.
+    """Duration of one stage, and its budget.
 
     Attributes:
         stage: "load", "expose", "detect", "plan", "check", "prepare", "play", ...
         step: Index of the step in the shot.
-        cycle: Index of the rearrangement cycle; -1 outside of one.
+        cycle: Index of the rearrangement cycle. -1 outside of a cycle.
         t_start_s: Start on the session's clock, from the start of the shot.
         duration_s: Duration on the session's clock. In a dry run this is the
             modelled time.
         host_s: Duration on this computer's clock. Never decisive in a dry run.
-        budget_s: What it may take; nan if it has no budget.
+        budget_s: Its budget. nan if it has none.
     """
 
     stage: str
@@ -87,23 +87,23 @@ class StageTiming:
     def over_budget(self) -> bool:
         """Whether it took longer than its budget.
 
-        A millisecond more is allowed: on a real clock each wait ends a little late, and a
-        load or a fixed window that was kept would count as exceeded.
+        A millisecond more is allowed. On a real clock each wait ends a little late, so a load or a fixed
+        window would otherwise always count as exceeded.
         """
         return self.duration_s > self.budget_s + OVERSHOOT_S
 
 
 @dataclass(frozen=True, slots=True)
 class StepTiming:
-    """How long a step should have taken, and how long it took.
+    """Planned and achieved duration of a step.
 
     Attributes:
         step: Index of the step in the shot.
         name: Its name.
-        timed_by: What timed it: "computer", or the role of the hardware.
+        timed_by: Its clock, which is "computer" or the role of the hardware.
         t_start_s: Start on the session's clock, from the start of the shot.
-        planned_s: Its planned duration; at most, where it may end earlier.
-        achieved_s: Its duration: as the hardware reports it, otherwise on the session's clock.
+        planned_s: Its planned duration. The maximum if it may end earlier.
+        achieved_s: Its duration as the hardware reports it, otherwise on the session's clock.
         host_s: Duration on this computer's clock, with all calls.
     """
 
@@ -124,7 +124,7 @@ class LineEdge:
         step: Index of the step in the shot.
         line: Name of the line.
         on: Whether it is on from then on.
-        t_s: When, from the start of the program of its step: a multiple of the box's resolution.
+        t_s: Time from the start of the program of its step, a multiple of the box's resolution.
         t_start_s: Start of this program on the session's clock, from the start of the shot.
     """
 
@@ -137,20 +137,19 @@ class LineEdge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageRecord:
-    """One image and what was seen on it.
+    """One image with the detected atoms.
 
     Attributes:
         frame: The frame, or None if frames are not kept.
         occupancy: bool (n_rows, n_cols), as the detector saw it.
         confidence: float32 (n_rows, n_cols), the detector's confidence per site.
         step: Index of the step in the shot.
-        cycle: Index of the rearrangement cycle that it ended; -1 for the image of
-            an ``image`` step.
+        cycle: Index of the rearrangement cycle that it ended. -1 for the image of an ``image`` step.
         t_start_s: Start of the exposure, from the start of the shot.
         exposure_s: Exposure time, in seconds.
         name: Name of the image, unique in the shot and the same in every shot.
-        signal: float64 (n_rows, n_cols), what the detector compared with its thresholds; None if it does not
-            report it.
+        signal: float64 (n_rows, n_cols), the values that the detector compared with its thresholds. None if
+            it does not report them.
     """
 
     frame: Frame | None
@@ -172,12 +171,12 @@ class CycleRecord:
         step: Index of the step in the shot.
         cycle: Index of the cycle within its step.
         plan: The whole plan.
-        report: What the check said of it.
-        n_batches_played: How many batches fitted into the window and were played.
+        report: The result of the check.
+        n_batches_played: Number of batches that fitted into the window and were played.
         window_s: The window of this cycle, in seconds.
         t_start_s: Start of the cycle, from the start of the shot.
-        moves_s: Modelled duration of what was played, overheads included.
-        late_s: How long after the window the moves ended; 0 if they ended in time.
+        moves_s: Modelled duration of the played batches, overheads included.
+        late_s: How long after the window the moves ended. 0 if they ended in time.
     """
 
     step: int
@@ -197,14 +196,14 @@ class CycleRecord:
 
 
 def follow_atoms(before: Occupancy, cycles: Iterable[CycleRecord]) -> tuple[Occupancy, Occupancy]:
-    """Where atoms are after cycles without losses.
+    """Where the atoms are after cycles if none is lost.
 
     Args:
         before: bool (n_rows, n_cols), the image that the first cycle was planned on.
         cycles: The cycles, in order.
 
     Returns:
-        The sites of moved atoms and of those that stayed, bool (n_rows, n_cols), without ejected ones.
+        The sites of moved atoms and of atoms that stayed, bool (n_rows, n_cols), without ejected atoms.
     """
     atoms, moved = before.copy(), np.zeros_like(before)
     for cycle in cycles:
@@ -238,20 +237,20 @@ class ShotRecord:
         timing: In the order the stages ended.
         steps: Planned and achieved durations of the steps that have ended.
         edges: In the order they were played; within a program, line by line.
-        seen_defect_free_cycle: Index of the first cycle whose image met the target; -1 if none.
+        seen_defect_free_cycle: Index of the first cycle whose image met the target. -1 if none.
         success: Whether the last ``image`` step met the target.
-        filling_fraction: Filling of the target on the last ``image`` step; nan
-            without one, or if a rearrangement follows it.
-        n_missing_atoms: Atoms that the loading fell short of the target.
+        filling_fraction: Filling of the target on the last ``image`` step. nan without such a step, or if a
+            rearrangement follows it.
+        n_missing_atoms: Number of atoms by which the loading fell short of the target.
         readings: Values read from devices during the shot.
-        parameters: What differs from the files in this shot: address -> value, SI.
-        target: Its target; None for that of the run.
-        calibrations: Those in use: kind -> id.
-        atom_events: What a simulation reports about the atoms: name -> structured array.
-        thresholds: float64 (n_rows, n_cols), there is an atom where the signal of an image exceeds them; None
-            if the detector does not report them.
-        sites_px: float64 (n_rows, n_cols, 2), (y, x) of the sites on the frames, in pixels; None likewise.
-        signal_unit: Unit of signals and thresholds: "counts"; "" likewise.
+        parameters: Settings that differ from the files in this shot: address -> value, SI.
+        target: Its target. None for the target of the run.
+        calibrations: Kind -> id of the calibration in use.
+        atom_events: A simulation's reports about the atoms: name -> structured array.
+        thresholds: float64 (n_rows, n_cols). A site has an atom if the signal of an image exceeds its
+            threshold. None if the detector does not report thresholds.
+        sites_px: float64 (n_rows, n_cols, 2), (y, x) of the sites on the frames, in pixels. None if unknown.
+        signal_unit: Unit of signals and thresholds, such as "counts". "" if unknown.
     """
 
     shot_index: int
@@ -291,22 +290,22 @@ class ShotRecord:
 
     @property
     def n_batches(self) -> int:
-        """Batches that were played."""
+        """Number of batches that were played."""
         return sum(cycle.n_batches_played for cycle in self.cycles)
 
     @property
     def n_atom_moves(self) -> int:
-        """Atom moves that were played."""
+        """Number of atom moves that were played."""
         return sum(cycle.n_atom_moves_played for cycle in self.cycles)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunRecord:
-    """What is known of a run when it starts; it does not change afterwards.
+    """Properties of a run that are fixed when it starts.
 
     Attributes:
         name: The sequence's name.
-        n_shots: Shots asked for.
+        n_shots: Number of requested shots.
         seed: The run's seed.
         simulated: Whether all hardware is simulated.
         t_start_utc: Wall time, ISO 8601, UTC.
@@ -316,20 +315,20 @@ class RunRecord:
         sequence_path: Where the sequence came from.
         profile_path: Where the profile came from.
         resolved: Every setting after defaults and overrides, SI, JSON-ready.
-        overrides: What ``--set`` and other options changed: address -> "value", SI; "unit"; and "written", as
-            it was typed.
-        units: SI units of what was set and scanned: address -> unit; without those that have none.
+        overrides: Changes by ``--set`` and other options: address -> "value" (SI), "unit", and "written" (as
+            typed).
+        units: Address -> SI unit of each setting that was set or scanned and has a unit.
         devices: ``describe()`` of each device: role -> values.
-        plugins: Each plugin that is used, by :class:`labseq.session.sources.RunCode`.
+        plugins: Each plugin in use, by :class:`labseq.session.sources.RunCode`.
         provenance: Code and package versions, host, user.
         record_frames: Which frames are kept: "all", "last" or "none".
         grid_spacing_m: Spacing of the sites, in metres.
         lattice: Lattice of the grid.
-        scan: What was scanned: "addresses", "points", "point_of_shot", ...; empty without a scan.
-        calibrations: Those in use: kind -> id.
-        steps: Names of the steps, in order; each is unique.
-        resumed: How it was resumed after it had ended early, in order: ``t_utc``, ``first_shot``, how it had
-            ended (``before``), ``changes`` that were accepted (each ``what``, ``was`` and ``now``) and
+        scan: The scan, with "addresses", "points", "point_of_shot", ... Empty without a scan.
+        calibrations: Kind -> id of the calibration in use.
+        steps: Unique names of the steps, in order.
+        resumed: How it was resumed after it had ended early, in order. Each has ``t_utc``, ``first_shot``,
+            how the run had ended (``before``), accepted ``changes`` (each ``what``, ``was`` and ``now``) and
             ``provenance``.
     """
 
@@ -363,15 +362,15 @@ class TimelineEntry:
     """One bar of a shot's timeline.
 
     Attributes:
-        label: What happens, for example "image" or "cycle 3: move".
-        duration_s: How long it takes at most, in seconds.
-        min_duration_s: How long it takes at least; 0 if it may be left out.
-        n_images: Images that it takes at most.
+        label: Its name, for example "image" or "cycle 3: move".
+        duration_s: Its maximum duration, in seconds.
+        min_duration_s: Its minimum duration. 0 if it may be left out.
+        n_images: Maximum number of its images.
         exposure_s: Exposure of each image, in seconds.
-        kind: Kind of step that the profile's lines know it by, "image"; "" for one that they do not go with.
-        timed_by: What times it.
-        latency_s: How long after the end of the part before it it begins at the outputs, in seconds.
-        pulses: When it turns lines on itself.
+        kind: Kind of step for the profile's lines, such as "image". "" if no lines go with it.
+        timed_by: Its clock.
+        latency_s: Time from the end of the part before it to its start at the outputs, in seconds.
+        pulses: The times at which it turns lines on itself.
     """
 
     label: str

@@ -14,15 +14,15 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class ScanRange:
-    """The values that an address may take in an adaptive scan, SI.
+    """The allowed values of an address in an adaptive scan, SI.
 
     Attributes:
         address: For example "planner.degree_of_parallelism".
         low: The least value.
         high: The greatest value.
-        is_whole: Whether only whole numbers count.
-        n_steps: Number of equal steps that the values are apart by; 0 where any value will do.
-        start: The value that the files have; nan if they have none.
+        is_whole: Whether only whole numbers are allowed.
+        n_steps: Number of equal steps from ``low`` to ``high``. 0 if any value is allowed.
+        start: The value in the files. nan if they have none.
     """
 
     address: str
@@ -48,7 +48,7 @@ class ScanRange:
         return round(value) if self.is_whole else value
 
     def allowed(self, value: object) -> float | None:
-        """A number without rounding error, if it is one of the range's values; otherwise None.
+        """A number without rounding error if it is one of the range's values, otherwise None.
 
         Example:
             >>> dop = ScanRange("planner.degree_of_parallelism", 2, 15, is_whole=True)
@@ -61,14 +61,14 @@ class ScanRange:
             number = float(value)
         except OverflowError:
             return None
-        if not self.low - self.high <= number - self.low <= 2 * (self.high - self.low):  # nan is not, either
+        if not self.low - self.high <= number - self.low <= 2 * (self.high - self.low):  # also excludes nan
             return None
         near = self.at(self.fraction(number))
         tolerance = 1e-9 * (self.high - self.low) / (self.n_steps or 1)
         return near if abs(near - number) <= tolerance else None
 
     def fraction(self, value: float) -> float:
-        """The opposite of :meth:`at`: 0 at ``low``, 1 at ``high``."""
+        """The inverse of :meth:`at`, with 0 at ``low`` and 1 at ``high``."""
         return (value - self.low) / (self.high - self.low)
 
 
@@ -78,8 +78,8 @@ class ScanSpace:
 
     Attributes:
         ranges: A range for each address.
-        n_points: The most points that will be asked for, those visited twice counted twice.
-        repeats: Shots of each point.
+        n_points: Maximum number of points. A point that is visited twice counts twice.
+        repeats: Number of shots at each point.
         seed: The run's seed.
     """
 
@@ -89,12 +89,12 @@ class ScanSpace:
     seed: int = 0
 
     def random(self, n_visited: int) -> np.random.Generator:
-        """Random numbers for the choice of a point; after as many points always the same ones.
+        """Random numbers for the choice of a point, which depend only on the number of points so far.
 
         Args:
             n_visited: Number of points that have been visited so far.
         """
-        # The first number separates these from the random numbers of shots.
+        # The first number separates them from the random numbers of shots.
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0x0ADA, n_visited)))
 
 
@@ -104,9 +104,9 @@ class VisitedPoint:
 
     Attributes:
         values: Address -> value, SI.
-        score: The higher, the better: the mean of the figure that the scan is to maximise over the
-            point's shots, its negative if it is to be minimised; nan if no shot has it.
-        shots: What the run's index tells of each shot: name of the figure -> number.
+        score: The mean of the quantity over the point's shots, or its negative if the scan minimises it. A
+            higher score is better. nan if no shot has the quantity.
+        shots: Quantities of each shot in the run's index: name -> number.
     """
 
     values: Mapping[str, float]
@@ -117,14 +117,13 @@ class VisitedPoint:
 class RandomStream:
     """The random numbers of one consumer (the simulation, a device).
 
-    Shot k in its attempt-th try draws from ``SeedSequence(seed, spawn_key=(k,
-    attempt))``, whatever happened before; the machine's own disorder comes from
-    the seed alone. Consumers other than the simulation get streams of their own,
-    distinguished by name, so that adding one does not change the others' draws.
+    Attempt a at shot k draws from ``SeedSequence(seed, spawn_key=(k, a))``, whatever happened before. The
+    machine's own disorder depends only on the seed. Consumers other than the simulation have their own
+    streams, distinguished by name, so that adding a consumer does not change the others' numbers.
 
     Args:
         seed: The run's seed.
-        name: Name of the consumer; "" is the simulation.
+        name: Name of the consumer. "" is the simulation.
     """
 
     def __init__(self, seed: int, name: str = "") -> None:
@@ -138,7 +137,7 @@ class RandomStream:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=self._key))
 
     def begin_shot(self, shot_index: int, attempt: int) -> None:
-        """Start the numbers of a shot; the sequencer calls it."""
+        """Start the random numbers of a shot. The sequencer calls this."""
         key = (shot_index, attempt, *self._key)
         self._shot = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
 

@@ -25,14 +25,12 @@ class SegmentKind(IntEnum):
 class FrequencyCourse(IntEnum):
     """Course of the frequencies from start to end of a segment, the same for all its tones.
 
-    In a segment of duration T a tone is at
-    ``f(t) = start_hz + (end_hz - start_hz) s(t / T)``, and its phase is
-    ``phase_rad`` plus 2 pi times the integral of f from 0 to t. The course s
-    rises from 0 to 1 and is symmetric, s(1 - u) = 1 - s(u), so that a tone's mean
-    frequency in a segment is that of start and end.
+    In a segment of duration T a tone is at ``f(t) = start_hz + (end_hz - start_hz) s(t / T)``, and its phase
+    is ``phase_rad`` plus 2 pi times the integral of f from 0 to t. The course s rises from 0 to 1 and is
+    symmetric, s(1 - u) = 1 - s(u), so that a tone's mean frequency in a segment is the mean of start and end.
 
     Attributes:
-        LINEAR: s(u) = u: constant speed.
+        LINEAR: s(u) = u, constant speed.
         MINIMUM_JERK: s(u) = 10 u^3 - 15 u^4 + 6 u^5, the course with the least
             mean square jerk that starts and ends at rest without acceleration
             (Flash and Hogan, J. Neurosci. 5, 1688, 1985). The greatest speed is 15/8 of the mean.
@@ -47,11 +45,11 @@ class FrequencyCourse(IntEnum):
 
     @property
     def fastest(self) -> float:
-        """Greatest speed relative to the mean speed: the greatest slope of s(u)."""
+        """Greatest speed relative to the mean speed, which is the greatest slope of s(u)."""
         return (1.0, 15 / 8, 3 / 2)[self]
 
     def fraction(self, u: float) -> float:
-        """The course s(u): the fraction of its path that a tone has completed.
+        """The course s(u), the fraction of its path that a tone has completed.
 
         Args:
             u: Fraction of the segment's duration that has passed, 0 to 1.
@@ -67,7 +65,7 @@ class FrequencyCourse(IntEnum):
         return u**2 * (3.0 - 2.0 * u)
 
     def integral(self, u: float) -> float:
-        """Integral of the course from 0 to u; 1/2 at 1 for every course.
+        """Integral of the course from 0 to u, which is 1/2 at u = 1 for every course.
 
         In a segment of duration T a tone's phase has advanced by
         ``2 pi T (start_hz u + (end_hz - start_hz) integral(u))``.
@@ -88,15 +86,14 @@ class FrequencyCourse(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AxisTones:
-    """The tones of one AOD axis, segment by segment, held as flat arrays.
+    """The tones of one AOD axis, segment by segment, stored as flat arrays.
 
-    Within a segment the frequency follows :class:`FrequencyCourse`. The depth of a
-    tone, which goes as its amplitude squared, is linear in time: in a segment of
-    duration T, a tone that goes from amplitude a0 to a1 has
-    ``a(t) = sqrt(a0^2 + (a1^2 - a0^2) t / T)``. So ramps are linear in trap depth.
+    Within a segment the frequency follows :class:`FrequencyCourse`. The depth of a tone, proportional to its
+    amplitude squared, is linear in time. In a segment of duration T, the amplitude of a tone goes from a0 to
+    a1 as ``a(t) = sqrt(a0^2 + (a1^2 - a0^2) t / T)``.
 
     Attributes:
-        offsets: int32 (n_segments + 1,); segment i has tones ``offsets[i]:offsets[i + 1]``.
+        offsets: int32 (n_segments + 1,). Segment i has tones ``offsets[i]:offsets[i + 1]``.
         start_hz: float64 (n_tones,), frequency at the start of the segment.
         end_hz: float64 (n_tones,), frequency at its end.
         start_amplitude: float64 (n_tones,), fraction of full scale at its start.
@@ -127,8 +124,7 @@ class TonesNow:
     Attributes:
         frequency_hz: float64 (n_tones,).
         amplitude: float64 (n_tones,), fraction of full scale.
-        phase_rad: float64 (n_tones,), from 0 to 2 pi; the axis plays the sum of
-            ``amplitude cos(phase)``.
+        phase_rad: float64 (n_tones,), from 0 to 2 pi. The axis plays the sum of ``amplitude cos(phase)``.
     """
 
     frequency_hz: NDArray[np.float64]
@@ -141,8 +137,8 @@ class TonesAt:
     """The tones of both axes at one time.
 
     Attributes:
-        row: Those of the row axis.
-        column: Those of the column axis.
+        row: Tones of the row axis.
+        column: Tones of the column axis.
     """
 
     row: TonesNow
@@ -161,7 +157,7 @@ class ToneProgram:
         duration_s: float64 (n_segments,).
         kind: int8 (n_segments,), values of :class:`SegmentKind`.
         batch: int32 (n_segments,), the batch of the plan that a segment belongs to.
-        course: int8 (n_segments,), values of :class:`FrequencyCourse`; LINEAR by default.
+        course: int8 (n_segments,), values of :class:`FrequencyCourse`. LINEAR by default.
     """
 
     row: AxisTones
@@ -180,7 +176,7 @@ class ToneProgram:
             object.__setattr__(self, name, values)
         for axis in (self.row, self.column):
             if len(axis.offsets) != n_segments + 1:
-                raise ValueError("both axes must have as many segments as there are durations")
+                raise ValueError("both axes must have as many segments as durations")
 
     @property
     def n_segments(self) -> int:
@@ -194,14 +190,14 @@ class ToneProgram:
 
     @property
     def joint_s(self) -> NDArray[np.float64]:
-        """float64 (n_segments + 1,): start of each segment, and end of the last one."""
+        """Start of each segment, and end of the last, float64 (n_segments + 1,)."""
         return np.concatenate([[0.0], np.cumsum(self.duration_s)])
 
     def tones_at(self, t_s: float) -> TonesAt:
         """The tones at a time.
 
-        At a joint it is the start of the segment that begins there. Before the
-        program and from its end on there are no tones.
+        At a joint these are the tones at the start of the next segment. Before and after the program there
+        are no tones.
 
         Args:
             t_s: Time from the start of the program, in seconds.
@@ -243,7 +239,7 @@ class DepthRamp:
     Attributes:
         start: Depth at the start, as a fraction of the nominal depth.
         end: Depth at the end.
-        duration_s: Duration of the ramp; 0 for a switch.
+        duration_s: Duration of the ramp. 0 for a switch.
     """
 
     start: float
@@ -257,10 +253,10 @@ class TweezersFacts:
 
     Attributes:
         resolution_s: Step of the clock that times their ramps and releases.
-        shortest_release_s: Shortest time for which they can turn their light off; inf: they cannot.
+        shortest_release_s: Shortest time for which they can turn their light off. inf if they cannot.
         latency_s: Typical time from the call of ``ramp`` to its start at the outputs.
-        control: What labseq can set: "tones" of rows and columns (``load``), "sites" with a weight each
-            (``load_weights``), or "nothing".
+        control: The values that labseq can set: "tones" of rows and columns (``load``), "sites" with a weight
+            each (``load_weights``), or "nothing".
         ramps: Whether they can have depths between off and nominal.
     """
 
@@ -279,8 +275,8 @@ class TweezerAmplitudes:
         row: float64 (n_rows,).
         column: float64 (n_cols,).
         dark_s: How long the light was off just before, in seconds.
-        site: float64 (n_rows, n_cols), power of each tweezer where no tones make it, relative to the nominal
-            power; None: it follows from the tones.
+        site: float64 (n_rows, n_cols), power of each tweezer that is not made by tones, relative to the
+            nominal power. None if it follows from the tones.
     """
 
     row: NDArray[np.float64]

@@ -89,7 +89,7 @@ def test_wrong_numbers_of_shots_and_seeds_are_reported_as_all_other_settings(cal
 def test_safe_changes_no_sequence(call: Any) -> None:
     code, out, err = call("safe", "virtual", "--set", "camera.gain=1")
     assert (code, out) == (2, "")
-    assert err.startswith("--set camera.gain=1: there is no sequence here")
+    assert err.startswith("--set camera.gain=1: this command uses no sequence")
 
 
 @pytest.mark.parametrize(

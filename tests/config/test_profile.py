@@ -178,7 +178,7 @@ shutter: {use: virtual} => shutter: virtual
 shutter: {use: virtual} => shutter: {us: virtual}
   22:12: 'use' is missing from 'shutter' (the name of a plugin); did you write 'us' for it?
 shutter: {use: virtual} => shutter: {use: virtual, role: camera, blinding: {}}
-  22:41: `blinding` is set for a camera; expected it for `role: device` only
+  22:41: `blinding` is set for a camera; expected `role: device` with it
 shutter: {use: virtual} => shutter: {use: virtual}⏎equalise: {device: shuter}
   23:20: there is no device 'shuter'; expected 'camera', 'shutter'
 {call: 3 s} => {call:3 s}
@@ -186,7 +186,7 @@ shutter: {use: virtual} => shutter: {use: virtual}⏎equalise: {device: shuter}
 grid: => shot:
   4:1: this is a sequence (it has the key 'shot'); expected a hardware profile
 labseq: 1 => labseq: 3
-  2:9: this file is written for a newer labseq: its format is 3, this labseq reads 1; update labseq
+  2:9: this file is for a newer labseq (its format is 3, this labseq reads 1); update labseq
 """
 
 

@@ -289,7 +289,7 @@ class Custom(Settings):
     [
         ("limit: 12", "1:12: limit: 12 is reserved; expected another number; ask the night shift"),
         ("limit: 11", "1:12: limit: 11 is odd"),
-        ("limit: 13", "1:4: these settings make the plugin's check fail: KeyError: 'unlucky'"),
+        ("limit: 13", "1:4: the plugin's check of these settings failed: KeyError: 'unlucky'"),
         ("limit: 1, pair: [1, 2]", "1:4: a: more numbers than the limit"),
         ("pair: [1, x]", "1:15: pair.1 is 'x'"),
         ("pair: 5", "1:11: pair is 5; expected a list"),

@@ -40,7 +40,7 @@ shots: 20 => shots:⇥20
 target: {pattern: compact, rows: 15, cols: 15}⏎ => target: {pattern: compact, rows: 15⏎
   7:9: the '{' that opens here is not closed; expected ',' or '}'
 rows: 15, cols => rows: 15 cols
-  7:41: the {...} that opens in column 9 goes wrong here; expected ',' or '}'
+  7:41: the {...} that opens in column 9 has an error here; expected ',' or '}'
 - wait: {duration: 1 ms}⏎  - image:⏎ => - wait: {duration: 1 ms⏎
   26:11: the '{' that opens here is not closed; expected ',' or '}'
 rows: 15, cols: 15 => rows: 15, rows: 15
@@ -48,11 +48,11 @@ rows: 15, cols: 15 => rows: 15, rows: 15
 attempts: 2 => shots: 2
   12:1: 'shots' is given twice (first in line 5, column 1); remove one of them
   - image: { =>    - image: {
-  16:4: the indentation of this line fits no line above; expected that of the other items of the list
+  16:4: the indentation of this line matches no line above; expected the indentation of the other list items
 shots: 20 =>   shots: 20
-  5:8: this line is indented further than line 4, which has a value already; expected 0 spaces as there
+  5:8: this line is indented further than line 4, which already has a value; expected 0 spaces as in line 4
       cycles =>        cycles
-  20:7: the indentation of this line fits no line above; expected 7 spaces as in line 19 or 4 as in line 17
+  20:7: the indentation of this line matches no line above; expected 7 spaces as in line 19 or 4 as in line 17
 name: compact-225 => name: 'compact-225
   3:7: the quotation mark that opens here is closed only in line 24; expected a quotation mark at the end of the text
 name: compact-225 => name: 'compact'-225
@@ -100,7 +100,7 @@ shots: 20 => shots: 2\u20280
   - image: { =>   -\u3000image: {
   16:4: an ideographic space (U+3000) is used for indentation; expected plain spaces
 cols: 15} => cols: 15, origin: 1,2}
-  7:58: a key is 2; expected text; a ',' begins another key: write 4.5 for 4,5 and [4, 5] for a list
+  7:58: a key is 2; expected text; a ',' begins another key, so write 4.5 for 4,5 and [4, 5] for a list
 name: compact-225 => name: "\\ud800"
   3:7: an escape in this text is half of a character; expected the character itself
 name: compact-225 => name: "\\U00110000"
@@ -128,7 +128,7 @@ seed: 7 => seed: 9223372036854775808
 seed: 7 => seed: 11111111111111111111111111111111111111111111111111111111111111111111111111111111111111111111111111111
   6:7: a number of 101 characters is too long; expected a number of a few digits
 labseq: 1 => labseq: 2
-  2:9: this file is written for a newer labseq: its format is 2, this labseq reads 1; update labseq
+  2:9: this file is for a newer labseq (its format is 2, this labseq reads 1); update labseq
 labseq: 1⏎ => ∅
   2:1: 'labseq' is missing (version of the file format: 1)
 name: compact-225 => name: 225

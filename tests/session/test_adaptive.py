@@ -187,7 +187,7 @@ BOTH = "from: 1, to: 9"
     [
         ("use: climb", "1:7: 'over' is missing"),
         (f"use: clim, {OVER}, points: 3", "1:13: unknown scanner 'clim'; expected one of"),
-        (f"use: climb, {OVER}", "1:7: 'points' is missing from 'scan' (the maximum number of points)"),
+        (f"use: climb, {OVER}", "1:7: 'points' (the maximum number of points) is missing from 'scan'"),
         (f"use: climb, {OVER}, points: 3, stop: 0.1", "'stop' is not a setting of scanner 'climb'"),
         (f"use: climb, over: {{{DOP}: {{from: 1}}}}, maximise: success, points: 3", "'to' is missing"),
         (f"use: climb, over: {{{DOP}: [1, 9]}}, maximise: success, points: 3", f"{DOP} is a list"),
@@ -197,7 +197,7 @@ BOTH = "from: 1, to: 9"
         ),
         (
             f"use: climb, over: {{{DOP}: {{from: 0, to: 9}}}}, maximise: success, points: 3",
-            f"puts it into '{DOP}'",
+            f"comes from the scan of '{DOP}'",
         ),
         (f"use: climb, {OVER}, minimise: success, points: 3", "'maximise' and 'minimise' are both given"),
         (

@@ -101,7 +101,7 @@ def test_some_sites_are_measured(tmp_path: Path) -> None:
         ("measure: [{value: loading, fit: gausian}]", "5:33: there is no model 'gausian'"),
         (
             "measure: [{value: loading, report: decay}]",
-            "5:28: 'report' without a fit; expected 'fit' as well",
+            "5:28: 'report' is given without a fit; expected 'fit' as well",
         ),
         ("measure: [{value: analysis.x.y}]", "the sequence must list the analysis"),
         (
