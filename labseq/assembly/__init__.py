@@ -1,1 +1,1 @@
-"""From files to objects: settings validated, plugins chosen and constructed; no device is opened."""
+"""Turns files into objects: validates settings, and chooses and constructs plugins. Opens no device."""

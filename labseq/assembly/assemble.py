@@ -1,4 +1,4 @@
-"""Builds a run from its files: chooses plugins, validates settings; no device is opened."""
+"""Builds a run from its files: chooses plugins and validates settings. Opens no device."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ class Assembly:
         target: The target pattern.
         planner: The planner and its settings.
         steps: Name and step, in order.
-        resolved: Every setting after defaults and overrides, SI, JSON-ready; for a scan, at its first
+        resolved: Every setting after defaults and overrides, SI, JSON-ready. For a scan, at its first
             point, like all other attributes.
-        scanned: The points of the scan; None without one.
+        scanned: The points of the scan. None without a scan.
         policy: Reactions to failures and exceeded budgets.
         search: The scanner, if it chooses the points during the run.
-        led: What another control system may set for each shot; None for nothing.
+        led: The settings that another control system may change for each shot. None if there are none.
     """
 
     document: Document
@@ -87,7 +87,7 @@ class Assembly:
 
     @property
     def first_point(self) -> Point:
-        """The settings of the first point of a scan; those of the files if no point is known yet."""
+        """The settings of the first point of a scan, or of the files if no point is known yet."""
         alone = self.scanned is None or self.search is not None
         return self._alone if alone else self.at(0)
 
@@ -96,14 +96,14 @@ class Assembly:
         return self._alone if self.scanned is None else self.scanned.at(number)
 
     def point_of_shot(self, seed: int) -> list[int]:
-        """Number of the point of each shot; without a scan all are at one point."""
+        """Number of the point of each shot. Without a scan all shots are at one point."""
         n_shots = self.sequence.shots
         if self.scanned is None:
             return [0] * n_shots
         return self.scanned.scan.points_of_shots(seed, n_shots).tolist()
 
     def scan_record(self, seed: int) -> dict[str, Any]:
-        """The scan for the run's record, JSON-ready; empty without one."""
+        """The scan for the run's record, JSON-ready. Empty without a scan."""
         if self.scanned is None:
             return {}
         if self.search is not None:
@@ -128,10 +128,10 @@ def assemble(
     """Read and validate everything that can be validated without opening a device.
 
     Args:
-        sequence_path: The sequence file, or the name of one; see :func:`labseq.config.find.find_sequence`.
+        sequence_path: File or name of the sequence, see :func:`labseq.config.find.find_sequence`.
         options: Values that replace those in the files.
-        kept: The sequence's text, of a run that was queued or began earlier.
-        recorded: Profile and calibrations of a run that began earlier.
+        kept: The sequence's text, if the run was queued or began earlier.
+        recorded: Profile and calibrations, if the run began earlier.
 
     Raises:
         ConfigError: The sequence, the profile or an override has an error.
@@ -139,7 +139,7 @@ def assemble(
         PluginLoadError: A named plugin failed to load.
     """
     profile, dry_run = options.profile, options.dry_run
-    # a kept text needs no file: it may be gone by now
+    # a kept text needs no file, which may no longer exist
     sequence_path = sequence_path if kept is not None else find_sequence(sequence_path)
     for_sequence, for_profile = split_overrides(options.overrides)
     profile_set = [override._replace(address=f"{PROFILE}{override.address}") for override in for_profile]
@@ -154,7 +154,7 @@ def assemble(
         )
     except ConfigError as error:
         raise problems.stop(error) from None
-    # at the points of a scan, the errors of the files would be found again
+    # otherwise the points of a scan would repeat the errors of the files
     scan = None if problems.problems else scan
     try:
         try:
@@ -177,7 +177,7 @@ def assemble(
 
 
 def assemble_recorded(recorded: RecordedFiles, options: Options) -> Assembly:
-    """Assemble a run from files and calibrations of a recorded one; see :func:`assemble`."""
+    """Assemble a run from files and calibrations of a recorded run (see :func:`assemble`)."""
     options = replace(options, profile=recorded.profile_path)
     return assemble(recorded.sequence_path, options, kept=recorded.sequence, recorded=recorded)
 
@@ -192,7 +192,7 @@ def _assembled(
     """Make the target, planner, steps and analyses of a sequence on its profile.
 
     Raises:
-        ConfigError: All problems, those that were collected before among them.
+        ConfigError: All problems, including the problems that were collected before.
     """
     is_whole = not problems.problems
     target: TargetPattern | None = None
@@ -206,7 +206,7 @@ def _assembled(
     all_steps = steps if len(steps) == len(sequence.shot) else None
     analyses, results = make_analyses(hardware, document, sequence, problems)
     if sequence.measure or sequence.policy.checks or sequence.scan:
-        from labseq.assembly.quantities import readings_of  # loads what other runs do not need
+        from labseq.assembly.quantities import readings_of  # loads modules that other runs do not need
 
         is_known = is_whole and all_steps is not None
         results = [*results, *readings_of(hardware, steps, is_whole=is_known)]
@@ -263,16 +263,16 @@ def _check_alone(document: Document, sequence: SequenceSpec, problems: ProblemCo
 
 
 def _core_dump(sequence: SequenceSpec) -> dict[str, Any]:
-    """What a sequence says apart from its plugins, its scan and its quantities."""
+    """The settings of a sequence except its plugins, its scan and its quantities."""
     others = {"shot", "target", "planner", "scan", "measure", "regions"}
     others |= {"leader"} if sequence.leader is None else set()
     return sequence.model_dump(mode="json", exclude=others)
 
 
 def _optional_dump(target: TargetPattern, sequence: Document, profile: Document) -> dict[str, Any]:
-    """The sites of each region, and address -> text of each expression; none where a file has none.
+    """The sites of each region, and address -> text of each expression, without empty entries.
 
-    The record of the run has the values of the expressions among the settings.
+    In the run's record, the values of the expressions are among the settings.
     """
     expressions = {
         prefix + ".".join(map(str, loc)): text
@@ -306,12 +306,12 @@ def make_target(
 ) -> tuple[TargetPattern, dict[str, Any] | None]:
     """The target of a sequence with its regions, and its settings for the record.
 
-    A sequence without a target has one that asks nothing.
+    A sequence without a target gets a target that requires nothing.
 
     Raises:
-        ConfigError: A pattern is unknown, has invalid settings, or does not fit on the grid; or a region does
-            not.
-        PluginLoadError: The pattern's plugin failed; names it.
+        ConfigError: A pattern is unknown or has invalid settings, or a pattern or region does not fit on the
+            grid.
+        PluginLoadError: The pattern's plugin failed. The message names it.
     """
     choice, grid = sequence.target, hardware.grid
     target, dumped = TargetPattern.none(grid.shape), None
@@ -319,17 +319,17 @@ def make_target(
         chosen = resolve(hardware.host, document, "pattern", choice)
         try:
             target = construct_target(chosen, grid)
-        except PluginLoadError:  # names the plugin at fault; no value of the file is wrong
+        except PluginLoadError:  # names the plugin at fault, as the file is right
             raise
         except LabseqError as error:
             note = (
-                f"the grid has {grid.n_rows} x {grid.n_cols} sites: {place_note(hardware.document, 'grid')}"
+                f"the grid has {grid.n_rows} x {grid.n_cols} sites, {place_note(hardware.document, 'grid')}"
             )
             problem = document.problem(choice.loc, str(error))
             raise ConfigError(replace(problem, notes=(note,))) from error
         dumped = {"pattern": chosen.entry.name, **dump(chosen.entry, chosen.settings)}
     if sequence.regions:
-        from labseq.assembly.regions import with_regions  # loads what other runs do not need
+        from labseq.assembly.regions import with_regions  # loads modules that other runs do not need
 
         target = with_regions(target, hardware, document, sequence.regions)
     return target, dumped
@@ -354,7 +354,7 @@ def make_steps(
             if step.needs_target and sequence.target is None:
                 what, hint = f"'{spec.kind}' needs a target", "target: {pattern: compact, rows: 10, cols: 10}"
                 raise document.error(spec.loc, what, "'target' in the sequence", f"write '{hint}'", key=True)
-        # A wrong step counts as one that takes an image: the user may have intended one.
+        # A wrong step counts as an image step, because the user may have intended one.
         image_seen = image_seen or step is None or step.takes_image
     return steps, dumps
 
@@ -364,7 +364,7 @@ def make_analyses(
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """The settings of each analysis of the sequence, for the record, and the names of its results.
 
-    Each is constructed once, to check that it can be; during the run they have their own processes.
+    Each is constructed once as a check. During the run analyses have their own processes.
     """
     dumps: list[dict[str, Any]] = []
     results: list[str] = []
@@ -387,13 +387,13 @@ def make_policy(
     target: TargetPattern | None,
     problems: ProblemCollector,
 ) -> tuple[RunPolicy, list[dict[str, Any]]]:
-    """The policies of a run and its steps, and for the record of each step the ``policy`` that it has.
+    """The policies of a run and its steps, and the ``policy`` of each step for its record.
 
     Args:
-        steps: The steps of a shot; None if some have errors.
+        steps: The steps of a shot. None if some have errors.
         results: Names of the results of the analyses.
-        target: The target; None if it has errors.
-        problems: Receives those of the policies, and of the quantities that they check.
+        target: The target. None if it has errors.
+        problems: Receives the problems of policies and of the quantities that they check.
     """
     settings = sequence.policy
     otherwise = StepPolicy(on_failure=settings.on_failure, over_budget=settings.over_budget)
@@ -413,11 +413,11 @@ def make_policy(
                 written = [setting for setting in settings_of(StepPolicy) if setting.key in keys]
                 dumps[number] = {"policy": {one.key: getattr(own, one.name) for one in written}}
             if steps is not None and own.retries and not steps[number][1].repeatable:
-                what = f"'{spec.kind}' cannot be tried again in the same shot: atoms may have moved"
+                what = f"'{spec.kind}' cannot be repeated in the same shot because atoms may have moved"
                 hint = "write 'on_failure: repeat_shot'"
                 raise document.error((*loc, "retries"), what, "0", hint, key=True)
     if settings.checks:
-        from labseq.assembly.quantities import check_checks  # loads what a run without checks does not need
+        from labseq.assembly.quantities import check_checks  # loads modules that only checks need
 
         check_checks(document, sequence, steps, results, target, problems)
     return RunPolicy(sequence.attempts, settings.when_exhausted, otherwise, tuple(policies)), dumps
@@ -433,15 +433,15 @@ def make_measures(
     host: PluginHost,
     problems: ProblemCollector,
 ) -> list[dict[str, Any]]:
-    """The quantities that a run measures, JSON-ready: as its sequence says, or chosen by its steps.
+    """The quantities that a run measures, from the sequence or chosen by its steps, JSON-ready.
 
     Args:
-        steps: The steps of a shot; None if some have errors.
-        target: The target; None if it has errors.
+        steps: The steps of a shot. None if some have errors.
+        target: The target. None if it has errors.
         results: Names of the results of the analyses.
-        scan: The scan; None without one, or if it has errors.
+        scan: The scan. None without a scan, or if it has errors.
         host: The plugins, which may offer models to fit.
-        problems: Receives those of names, fits and parameters.
+        problems: Receives the problems of names, fits and parameters.
     """
     if sequence.measure is None:
         summaries = [
@@ -450,7 +450,7 @@ def make_measures(
         ]
         has_target = target is not None and not target.is_none
         return [{"value": name} for name in measured_by_default(summaries, has_target=has_target)]
-    from labseq.assembly.quantities import check_quantity  # loads what other runs do not need
+    from labseq.assembly.quantities import check_quantity  # loads modules that other runs do not need
 
     for number, measure in enumerate(sequence.measure):
         with problems:

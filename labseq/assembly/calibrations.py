@@ -1,4 +1,4 @@
-"""The calibrations that a profile uses: found in its store, checked, and applied to the tones."""
+"""Finds, checks and applies the calibrations that a profile uses."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ FOLDER: Final = "calibrations"
 
 
 DRY_RUN_FOLDER: Final = "dry-run"
-"""Folder of dry runs in a store: calibrations measured on simulated atoms are not valid for real ones."""
+"""Folder of dry runs in a store, because calibrations of simulated atoms are not valid for real atoms."""
 
 
 BASIS: Final[Mapping[CalibrationKind, CalibrationKind]] = {"overlay": "frequencies", "thresholds": "sites"}
-"""Kind -> the kind of calibration that it was measured with and is only valid together with."""
+"""Kind -> the kind of calibration with which it was measured, and without which it is invalid."""
 
 
 PLACES: Final = frozenset({"threshold", "width", "sites", "frame", "centre_px", "angle"})
@@ -47,8 +47,8 @@ def store_of(document: Document, profile: ProfileSpec, dry_run: DryRun = "off") 
     """The folder of calibrations of a profile.
 
     Args:
-        dry_run: "off", "full" or "fast"; a profile with only virtual devices uses
-            the same store in a dry run.
+        dry_run: "off", "full" or "fast". A profile with only virtual devices uses the same store in a dry
+            run.
     """
     folder = profile.calibrations.folder or profile_dir(document.path) / FOLDER / document.path.stem
     choices = [profile.camera, profile.static_tweezers, profile.mobile_tweezers, *profile.devices.values()]
@@ -74,12 +74,12 @@ def calibrated(
     detector: Mapping[str, Any] | None = None,
     pins: Mapping[str, str] | None = None,
 ) -> ActiveCalibrations:
-    """Read the calibrations that a profile uses, and apply those of the tones.
+    """Read the calibrations that a profile uses, and apply the calibrations of the tones.
 
     Args:
-        problems: Receives the problems; a calibration that has one is not used.
-        detector: Settings of the detector in use, for the record; None if they do not matter.
-        pins: Kind -> id of the only calibrations to use; None for those of profile and store.
+        problems: Receives the problems. A calibration with a problem is not used.
+        detector: Settings of the detector in use, for the record. None if they do not matter.
+        pins: Kind -> id of the only calibrations to use. None for the calibrations of profile and store.
     """
     grid, store = profile.grid_model(), store_of(document, profile, dry_run)
     entries: dict[str, CalibrationEntry] = {}
@@ -91,7 +91,7 @@ def calibrated(
             problems.add(error)
             return ActiveCalibrations(entries, grid)
     for kind in CALIBRATION_KINDS:
-        with problems:  # a damaged one must not keep the others from being checked
+        with problems:  # a damaged calibration must not prevent the check of the others
             if pins is None:
                 stored = _chosen(document, profile, store, kind, active.get(kind))
             else:
@@ -99,7 +99,7 @@ def calibrated(
             if stored is not None:
                 check_grid(stored.entry, grid, str(stored.path))
                 entries[kind] = stored.entry
-    # before the tones: an overlay that is left out must not move them
+    # before the tones, because an overlay that is left out must not move them
     warnings = [*_dropped(entries), *_doubtful(entries, detector or {})]
     tones = grid
     with problems:
@@ -136,10 +136,10 @@ def _chosen(
     kind: CalibrationKind,
     active: Activation | None,
 ) -> Stored | None:
-    """The entry of a kind that the profile uses; ``active`` is what the store has in use.
+    """The entry of a kind that the profile uses. ``active`` is the store's entry in use.
 
     Raises:
-        ConfigError: It is missing or damaged.
+        ConfigError: The entry is missing or damaged.
     """
     pin = profile.calibrations.use.of(kind)
     if pin == OFF:
@@ -151,16 +151,16 @@ def _chosen(
     except ConfigError as error:
         where = document.problem(("calibrations", "use", kind), "").source
         note = (
-            f"it is in use as the calibration '{kind}'; "
-            f"'labseq calibration use {kind}=off --profile {quote(document.name)}' puts it aside"
+            f"it is the calibration '{kind}' in use; "
+            f"'labseq calibration use {kind}=off --profile {quote(document.name)}' turns it off"
             if pin is None
-            else f"asked for by the key 'calibrations.use.{kind}' of {where}"
+            else f"it is chosen by the key 'calibrations.use.{kind}' of {where}"
         )
         raise ConfigError([replace(one, notes=(*one.notes, note)) for one in error.problems]) from error
 
 
 def why_left_out(entry: CalibrationEntry, entries: Mapping[str, CalibrationEntry]) -> str:
-    """The reason why runs ignore a calibration although it is in use; "" if they do not.
+    """The reason why runs ignore a calibration although it is in use, or "" if they use it.
 
     Args:
         entry: The calibration.
@@ -214,7 +214,9 @@ def _with_tones(document: Document, grid: SiteGrid, entries: Mapping[str, Calibr
     if (frequencies := entries.get("frequencies")) is not None:
         row_hz, column_hz = frequencies.values["row_hz"], frequencies.values["column_hz"]
         grid = replace(grid, row_frequency_hz=row_hz, column_frequency_hz=column_hz)
-    if (overlay := entries.get("overlay")) is not None:  # second: it was measured with these frequencies
+    if (
+        overlay := entries.get("overlay")
+    ) is not None:  # second, because it was measured with these frequencies
         try:
             grid = correct_overlay(grid, overlay.values["offset_m"])
         except LimitError as error:

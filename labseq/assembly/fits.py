@@ -1,4 +1,4 @@
-"""Whether the fits that a sequence asks for can be made, and when they may end the run."""
+"""Checks the fits of a sequence, and the conditions under which they end the run."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def check_fit(
     Args:
         document: The sequence's file.
         sequence: Its content.
-        scan: Its scan; None without one, or if it has errors.
-        number: Index of the quantity among those that the run measures.
-        target: The target; None if it has errors.
+        scan: Its scan. None without a scan, or if it has errors.
+        number: Index of the quantity in the run's list.
+        target: The target. None if it has errors.
         host: The plugins.
 
     Raises:
@@ -47,7 +47,7 @@ def check_fit(
     name = measure.fit or ""
     model = find_model(document, (*place, "fit"), name, host)
     if sequence.scan is None:
-        what = "there is no scan along which to fit"
+        what = "a fit needs a scan"
         raise document.error((*place, "fit"), what, "'scan' in the sequence")
     named = [("report", measure.report)] if measure.report else []
     named += [("parameters", name) for name in measure.parameters]
@@ -68,7 +68,7 @@ def find_model(document: Document, place: Loc, name: str, host: PluginHost) -> M
     """A model of labseq or of a plugin.
 
     Raises:
-        ConfigError: There is none, or its plugin is at fault.
+        ConfigError: There is no such model, or its plugin failed.
     """
     if name in MODELS:
         return MODELS[name]
@@ -85,7 +85,7 @@ def find_model(document: Document, place: Loc, name: str, host: PluginHost) -> M
 
 
 def _scanned_unit(document: Document, place: Loc, scan: Scan | None) -> str:
-    """The SI unit of the value to fit along, the first of the scan that has several values."""
+    """The SI unit of the fit's x axis, which is the first scanned address with several values."""
     if scan is None or not scan.axes:  # an option may have replaced every address
         return ""
     several = (axis for axis in scan.axes if len({str(value.plain()) for value in axis.values}) > 1)
@@ -93,7 +93,7 @@ def _scanned_unit(document: Document, place: Loc, scan: Scan | None) -> str:
     try:
         return si_unit_of(f"1 {numbers_of(axis.values)[0].unit}")
     except ConfigError:
-        what = f"there is nothing to fit along: the values of '{clean(axis.address)}' are not numbers"
+        what = f"a fit needs numbers, but the values of '{clean(axis.address)}' are not"
         raise document.error((*place, "fit"), what, "a scan of a number") from None
 
 
@@ -113,7 +113,8 @@ def _check_stop(
     """Check the errors at which the run ends.
 
     Raises:
-        ConfigError: One cannot be read, is that of a fixed parameter, or the scan's order gives it no chance.
+        ConfigError: An error cannot be read, belongs to a fixed parameter, or the scan's order prevents an
+            early end.
     """
     fixed = {name for name in model.fixed if name not in measure.parameters}
     fixed |= {name for name, value in measure.parameters.items() if value != "free"}
@@ -131,7 +132,7 @@ def _check_stop(
             expected = f"the error to reach: 2 % of the value, or {'0.01' if unit in ('', '%') else limit}"
             raise document.error(loc, str(error), expected) from None
     if sequence.order != "shuffled":
-        what = "the run cannot end early: it takes all shots of a point before it goes to the next"
+        what = "the run cannot end early because it takes all shots of a point before the next point"
         hint = "write 'order: shuffled' and 'repeats'"
-        expected = "a scan whose points are taken in rounds"
+        expected = "a scan that takes its points in rounds"
         raise document.error((*place, "stop_when"), what, expected, hint, key=True)

@@ -1,4 +1,4 @@
-"""Constructs the devices of a run, checks their wiring, and rebuilds those that a scan changes."""
+"""Constructs the devices of a run, checks their wiring, and rebuilds devices that a scan changes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def clock_for(stop: StopFlag, *, virtual: bool, paced: bool = False) -> Clock:
 
 
 def build_lab(point: Point, target: TargetPattern, clock: Clock, seed: int) -> Lab:
-    """Construct the object of every role; no device is opened.
+    """Construct the object of every role. No device is opened.
 
     Raises:
         ConfigError: A constructor refuses its settings, or the lines conflict with the devices.
@@ -79,22 +79,22 @@ def construct(
     truth: tuple[SiteGrid, MotionSpec] | None = None,
     refused: dict[str, LabseqError] | None = None,
 ) -> tuple[dict[str, Any], tuple[RandomStream, ...]]:
-    """Construct the object of every role; constructors do no I/O, so nothing is open yet.
+    """Construct the object of every role. Constructors do no I/O, so nothing is open yet.
 
     Args:
         chosen: Role -> its plugin.
-        context: Their common context; name and random numbers are added for each, and the simulation if it
-            is among the chosen.
-        truth: Grid and motion without calibrations, for the simulation, in which they are measured; None
+        context: Their common context. Each gets its own name and random numbers, and the simulation if that
+            is chosen.
+        truth: Grid and motion without calibrations, for the simulation in which they are measured. None
             without calibrations.
-        refused: Receives the errors, role -> error; without it they are raised.
+        refused: Receives the errors, role -> error. Without it they are raised.
 
     Returns:
         Role -> object, and the random streams that the objects received.
 
     Raises:
-        ConfigError: A constructor refuses its settings; with their place.
-        PluginLoadError: A constructor raised, or made no object of that role; names the plugin.
+        ConfigError: A constructor refuses its settings. The error has their place.
+        PluginLoadError: A constructor raised, or made no object of that role. The message names the plugin.
     """
     objects: dict[str, Any] = {}
     streams: list[RandomStream] = []
@@ -124,7 +124,7 @@ def construct(
 def choice_of(
     planner: Planner, target: TargetPattern, window_s: float = math.inf, stop: StopFlag | None = None
 ) -> Sequence[str]:
-    """What a planner that chooses how it plans has chosen, then the alternatives; it may take seconds.
+    """The way of planning that a planner has chosen, then the alternatives. This may take seconds.
 
     Empty if the planner has no choice, or nothing is planned. See ``labseq.roles.ChoosesPlanner``.
     """
@@ -141,7 +141,7 @@ def choice_of(
 
 
 def parallelism_of(chosen: ChosenPlugin, planner: Any, motion: MotionSpec) -> int:
-    """Maximum number of mobile tweezers in a batch: the planner's own limit, else that of the motion."""
+    """Maximum number of mobile tweezers in a batch, from the planner or else from the motion."""
     dop = call_plugin(  # a property of the planner may raise, too
         chosen.entry.owner,
         "its degree_of_parallelism",
@@ -151,7 +151,7 @@ def parallelism_of(chosen: ChosenPlugin, planner: Any, motion: MotionSpec) -> in
 
 
 WARM_S: Final = 300.0
-"""Maximum time for a plugin to compile, in seconds; a slow computer needs half a minute."""
+"""Maximum time for a plugin to compile, in seconds. A slow computer needs half a minute."""
 
 
 def warm(lab: Lab, stop_flag: StopFlag, observer: RunObserver, *, devices: bool = True) -> None:
@@ -161,7 +161,7 @@ def warm(lab: Lab, stop_flag: StopFlag, observer: RunObserver, *, devices: bool 
         lab: The lab whose objects need kernels.
         stop_flag: Checked all the time.
         observer: Receives an event before kernels are compiled, and how long that took.
-        devices: Whether to compile the kernels of devices as well as those of planner and detector.
+        devices: Whether to compile the kernels of devices in addition to planner and detector.
 
     Raises:
         StopRequested: The operator asked to stop.

@@ -1,4 +1,4 @@
-"""The values that another control system sets for each shot: validated as the points of a scan are."""
+"""Values that another control system sets for each shot, validated like the points of a scan."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from labseq.units import split_quantity
 
 _TARGET: Final[Loc] = ("target",)
 _MAX_KNOWN: Final = 1000
-"""Settings that are remembered; a run with new values in every shot would fill the memory."""
+"""Maximum number of remembered settings, because new values in every shot would fill the memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LedPoints(ScanPoints):
     """The settings of shots with values that another control system has sent.
 
-    As :class:`ScanPoints`, its axes are the addresses that may be set, without values, and its only point is
-    that of the files.
+    As :class:`ScanPoints`, its axes are the addresses that may be set, without values. Its only point has the
+    settings of the files.
     """
 
     def at(self, number: int) -> Point:  # noqa: ARG002 - there is one
@@ -41,9 +41,9 @@ class LedPoints(ScanPoints):
         return self.with_texts({})
 
     def with_texts(self, texts: Mapping[str, str]) -> Point:
-        """The settings with values as for ``--set``, by their addresses; the same object for the same values.
+        """The settings with values as for ``--set``, by address. The same values give the same object.
 
-        The parameters of the point have every address that may be set.
+        The parameters of the point contain every address that may be set.
 
         Raises:
             ConfigError: An address is unknown or may not be set, or a plugin refuses a value.
@@ -65,10 +65,10 @@ class LedPoints(ScanPoints):
         return replace(point, parameters=parameters, target=target)
 
     def record(self, units: Mapping[str, str]) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The scan for the run's record, JSON-ready; the points are in the index.
+        """The scan for the run's record, JSON-ready. The points are in the index.
 
         Args:
-            units: SI units of the addresses, for those that the file does not write with a unit.
+            units: SI units of the addresses, for addresses without a unit in the file.
         """
         written = {axis.address: self.document.get(axis.loc) for axis in self.scan.axes}
         own = {
@@ -93,7 +93,7 @@ class LedPoints(ScanPoints):
         """Planner, steps and target by the place of their settings."""
         problems, plugins = ProblemCollector(), dict[Loc, Configured[Any]]()
         with problems:
-            # not super() alone: with slots, dataclass replaces the class that it would refer to
+            # not super() alone, because with slots dataclass replaces the class that it would refer to
             plugins = super(LedPoints, self)._planner_and_steps(document)
         with problems:
             key = _TARGET, repr(document.get(_TARGET))
@@ -116,13 +116,13 @@ class LedPoints(ScanPoints):
 def led_points(
     document: Document, sequence: SequenceSpec, hardware: ResolvedProfile, problems: ProblemCollector
 ) -> LedPoints:
-    """What a leader may set, checked.
+    """Check the settings that a leader may change.
 
     Args:
         problems: Receives addresses that do not exist or cannot be set.
     """
     if sequence.scan is not None:
-        what = "the sequence has a scan, and a leader sets values, too"
+        what = "a scan and a leader cannot both set values"
         problems.add(document.error(("scan",), what, "one of them", "remove 'scan' or 'leader'", key=True))
     axes: list[Axis] = []
     addresses = () if sequence.leader is None else sequence.leader.may_set

@@ -45,7 +45,7 @@ _LINE_BREAK: Final = re.compile(r"\r\n|\r|\n|$")
 _LIST_ROW: Final = re.compile(r"\[([^][]*)\]")
 _WORD: Final = re.compile(r"[^\s,;]+")
 _COMMENT: Final = re.compile(r"(?<![^\r\n])[ \t]*#[^\r\n]*(?:\r\n|\r|\n)?|#[^\r\n]*")
-"""A line with a comment and its end, or a comment behind a row."""
+"""A line that is a comment, or a comment after a row."""
 _COUNTED_ROW: Final = re.compile(r"(?<![^\r\n])[][ \t,;+-]*(?:\d|true|false)", re.IGNORECASE)
 _DRAWN: Final = {"#": True, ".": False}
 _COUNTED: Final = {"1": True, "0": False}
@@ -60,9 +60,9 @@ class Source:
     Attributes:
         occupancy: bool (n_rows, n_cols).
         label: Its origin, for messages.
-        seed: Seed of the random draw; None if it was not drawn.
-        target: Target of the shot; None if it is not from a shot.
-        machine: Resolved profile of the shot; None if it is not from a shot.
+        seed: Seed of the random draw. None if it was not drawn.
+        target: Target of the shot. None if it is not from a shot.
+        machine: Resolved profile of the shot. None if it is not from a shot.
     """
 
     occupancy: Occupancy
@@ -73,17 +73,17 @@ class Source:
 
 
 def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = None) -> Source:
-    """Read an occupancy in any of the forms that a user may give.
+    """Read an occupancy in any of the forms that a user can type.
 
     ``random:ROWSxCOLS@P`` is ``numpy.random.default_rng(seed).random((rows, cols)) < P``.
 
     Args:
         text: See :data:`FORMS`.
-        seed: Seed for ``random:``; a fresh one if None.
-        stdin: The stream for "-"; standard input if None.
+        seed: Seed for ``random:``. None for a new seed.
+        stdin: The stream for "-". None for standard input.
 
     Raises:
-        ConfigError: The text has none of these forms, or cannot be read; names the forms.
+        ConfigError: The text has none of these forms, or cannot be read. The message names the forms.
     """
     if text == "-":
         data = (stdin or sys.stdin.buffer).read(MAX_BYTES + 1)
@@ -91,10 +91,10 @@ def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = Non
     if text.startswith("random:"):
         return _random(text, seed)
     if not text:
-        raise ConfigError(Problem("the occupancy is an empty text", expected=FORMS))
+        raise ConfigError(Problem("the occupancy is empty", expected=FORMS))
     if text.lower().endswith(YAML_SUFFIXES):
         hint = "to plan for its target, write: labseq plan random:20x20@0.75 --target " + clean(text)
-        raise ConfigError(Problem("a sequence holds no occupancy", clean(text), expected=FORMS, hint=hint))
+        raise ConfigError(Problem("a sequence contains no occupancy", clean(text), expected=FORMS, hint=hint))
     match = _ARRAY.fullmatch(text)
     address, index = match.groups() if match else (text, None)
     path, name = split_name(address)
@@ -112,17 +112,17 @@ def read_source(text: str, seed: int | None = None, stdin: BinaryIO | None = Non
 
 
 def parse_text(data: bytes, name: str) -> Occupancy:
-    r"""Read rows of 0 and 1, or drawn with "." and "#"; or a list of rows.
+    r"""Read rows of 0 and 1, rows drawn with "." and "#", or a list of rows.
 
-    Numbers may be written as numpy.savetxt and spreadsheets do (1.0, 1e+00, True), with spaces, commas,
-    tabs or semicolons between them. Beside numbers, "#" begins a comment.
+    Numbers may be written as by numpy.savetxt and spreadsheets (1.0, 1e+00, True), with spaces, commas, tabs
+    or semicolons between them. Among numbers, "#" begins a comment.
 
     Args:
         data: UTF-8.
-        name: Where it comes from, for messages.
+        name: Its origin, for messages.
 
     Raises:
-        ConfigError: With line and column.
+        ConfigError: The text has an error. The message gives line and column.
 
     Example:
         >>> parse_text(b"1 0 1\n0 1 0\n", "mine").astype(int).tolist()
@@ -133,7 +133,9 @@ def parse_text(data: bytes, name: str) -> Occupancy:
         [[1, 0, 1]]
     """
     if len(data) > MAX_BYTES:
-        raise ConfigError(Problem(f"it is larger than {MAX_BYTES >> 20} MiB", name, expected=_size_limit()))
+        raise ConfigError(
+            Problem(f"this text is larger than {MAX_BYTES >> 20} MiB", name, expected=_size_limit())
+        )
     text = _Text(decode(data, name), name)
     rows = [(start, text.sites(start, row)) for start, row in text.rows()]
     if not rows:
@@ -148,11 +150,11 @@ def parse_text(data: bytes, name: str) -> Occupancy:
 
 
 class _Text:
-    """A text that holds an occupancy: its rows, and the places of what is wrong in them."""
+    """The text of an occupancy, with its rows and the places of errors."""
 
     def __init__(self, text: str, name: str) -> None:
         self._text, self._name = text, name
-        # beside numbers "#" begins a comment, as for numpy; in a drawing it is an atom
+        # among numbers "#" begins a comment, as in numpy, but in a drawing it is an atom
         self._is_drawn = _COUNTED_ROW.search(text) is None
 
     def place(self, index: int) -> tuple[int, int]:
@@ -165,7 +167,7 @@ class _Text:
 
     def rows(self) -> Iterator[tuple[int, str]]:
         """The start and the text of each row, without comments and the empty lines around all rows."""
-        # comments become spaces, so that all else keeps its place
+        # comments become spaces, so that everything else keeps its place
         text = self._text if self._is_drawn else _COMMENT.sub(self._blank, self._text)
         if "[" in text:
             yield from self._listed(text)
@@ -183,7 +185,7 @@ class _Text:
         return " " * len(comment[0])
 
     def _listed(self, text: str) -> Iterator[tuple[int, str]]:
-        """The rows of ``[[1, 0], [0, 1]]``, as Python and numpy write them; one may take several lines."""
+        """The rows of ``[[1, 0], [0, 1]]``, as Python and numpy write them. A row may take several lines."""
         between = _LIST_ROW.sub(lambda row: " " * len(row[0]), text)
         if stray := re.search(r"[^][\s,;]", between):
             raise self.error(f"{shown(stray[0])} is not within a row", stray.start(), "[[1, 0], [0, 1]]")
@@ -194,21 +196,21 @@ class _Text:
         """The sites of a row: index in the text, and whether there is an atom.
 
         Raises:
-            ConfigError: Something in it is not a site, or its values are separated in different ways.
+            ConfigError: A part of the row is not a site, or different separators are used.
         """
         words = list(_WORD.finditer(row))
         separators = [row[a.end() : b.start()].strip() for a, b in pairwise(words)]
         for word, separator in zip(words, separators, strict=False):
-            # "1,0 0,0" are two numbers with decimal commas, and "1,,0" lacks a value
+            # "1,0 0,0" is two numbers with decimal commas, and "1,,0" lacks a value
             if separator != separators[0] or len(separator) > 1:
-                what = f"the separator after '{clean(word[0])}' differs from the others of the row"
+                what = f"the separator after '{clean(word[0])}' differs from the others in the row"
                 expected = "one comma, semicolon, or space after each value"
                 hint = "write numbers with a decimal point"
                 raise self.error(what, start + word.end(), expected, hint)
         return [site for word in words for site in self._word(start + word.start(), word[0])]
 
     def _word(self, start: int, word: str) -> list[tuple[int, bool]]:
-        """The sites of a word: one for each character of "0110" and "#..#", or one number or truth value."""
+        """The sites of a word: one per character of "0110" and "#..#", or a single number or truth value."""
         characters = _DRAWN if self._is_drawn else _COUNTED
         wrong = next((i for i, character in enumerate(word) if character not in characters), None)
         if wrong is None:
@@ -227,7 +229,7 @@ class _Text:
 
 
 def _number(word: str) -> float | None:
-    """The number or truth value that a word is; None for other words."""
+    """The number or truth value of a word, or None for other words."""
     try:
         return float({"true": "1", "false": "0"}.get(word.lower(), word))
     except ValueError:
@@ -248,7 +250,7 @@ def _random(text: str, seed: int | None) -> Source:
         what = f"the filling fraction is '{clean(match[3])}'"
         raise ConfigError(Problem(what, clean(text), expected="a number from 0 to 1, or 0 % to 100 %"))
     if not (1 <= rows <= MAX_SITES and 1 <= cols <= MAX_SITES):
-        raise ConfigError(Problem(f"it has {rows} x {cols} sites", clean(text), expected=_size_limit()))
+        raise ConfigError(Problem(f"the grid has {rows} x {cols} sites", clean(text), expected=_size_limit()))
     if seed is None:
         seed = secrets.randbits(32)
     atoms = np.random.default_rng(seed).random((rows, cols)) < probability
@@ -256,20 +258,20 @@ def _random(text: str, seed: int | None) -> Source:
 
 
 def _array(path: Path, name: str, index: str | None, label: str) -> Occupancy:
-    """Read (n_rows, n_cols), or one of (n, n_rows, n_cols)."""
+    """Read an array (n_rows, n_cols), or one item of an array (n, n_rows, n_cols)."""
     with opened_array(path, name) as array:
         if array.ndim == 3:
             array = array[_index(index, array.shape[0], label)]
         elif array.ndim != 2 or index is not None:
-            what = f"it holds an array of shape {array.shape}"
-            expected = "(rows, columns), or with '#' and an index (occupancies, rows, columns)"
+            what = f"the array has shape {array.shape}"
+            expected = "(rows, columns), or (occupancies, rows, columns) with '#' and an index"
             raise ConfigError(Problem(what, label, expected=expected))
         return _checked(array, label)
 
 
 def _index(text: str | None, n: int, label: str) -> int:
     if text is None:
-        raise ConfigError(Problem(f"it holds {n} occupancies", label, expected=f"{label}#0 for the first"))
+        raise ConfigError(Problem(f"there are {n} occupancies", label, expected=f"{label}#0 for the first"))
     if re.fullmatch(r"[0-9]{1,9}", text) and int(text) < n:
         return int(text)
     raise ConfigError(Problem(f"there is no occupancy '{clean(text)}'", label, expected=f"0 to {n - 1}"))
@@ -277,7 +279,7 @@ def _index(text: str | None, n: int, label: str) -> int:
 
 def _checked(array: NDArray[Any], name: str) -> Occupancy:
     if not 1 <= min(array.shape) <= max(array.shape) <= MAX_SITES:
-        what = f"it has {array.shape[0]} x {array.shape[1]} sites"
+        what = f"the array has {array.shape[0]} x {array.shape[1]} sites"
         raise ConfigError(Problem(what, name, expected=_size_limit()))
     try:
         return as_occupancy(np.array(array))
@@ -292,18 +294,18 @@ def _shot(path: Path, cycle: str | None) -> Source:
     try:
         content = read_content(path)
     except RecordingError as error:
-        hint = f"name the array of another program's file: {clean(path.name)}:DATASET"
+        hint = f"for another program's file, name the array as in {clean(path.name)}:DATASET"
         raise ConfigError(Problem(error.text, name, expected="a shot's file", hint=hint)) from error
     cycles, images = content.record.cycles, content.record.images
     if not cycles:
-        raise ConfigError(Problem("this shot has no cycles", name, expected="a shot that was rearranged"))
+        raise ConfigError(Problem("this shot has no cycles", name, expected="a shot with a rearrangement"))
     index = 0 if cycle is None else int(cycle) if re.fullmatch(r"[0-9]{1,6}", cycle) else -1
     if not 0 <= index < len(cycles):
         there_are = "0, the only one" if len(cycles) == 1 else f"a cycle from 0 to {len(cycles) - 1}"
         raise ConfigError(Problem(f"there is no cycle '{clean(cycle or '')}'", name, expected=there_are))
     seen = image_before(cycles[index], images)
     if seen is None:
-        raise ConfigError(Problem(f"there is no image before cycle {index}", name, expected="one"))
+        raise ConfigError(Problem(f"there is no image before cycle {index}", name, expected="an image"))
     label = f"{name}, before cycle {index}"
     resolved = cast("dict[str, Any]", content.run["resolved"] or {})
     machine = profile_of_shot(resolved, content.record.parameters) if resolved.get("profile") else None
@@ -311,7 +313,7 @@ def _shot(path: Path, cycle: str | None) -> Source:
 
 
 def image_before(cycle: CycleRecord, images: Sequence[ImageRecord]) -> ImageRecord | None:
-    """The image that a cycle was planned on: the last one before the cycle's own; None if there is none."""
+    """The image for which a cycle was planned, which is the last before the cycle's own, or None."""
     before = [image for image in images if (image.step, image.cycle) < (cycle.step, cycle.cycle)]
     return before[-1] if before else None
 
@@ -321,7 +323,7 @@ def _read(path: Path) -> bytes:
         with path.open("rb") as file:
             return file.read(MAX_BYTES + 1)
     except OSError as error:
-        what = f"it cannot be read: {error.strerror}"
+        what = f"this cannot be read ({error.strerror})"
         raise ConfigError(Problem(what, clean(str(path)), expected=FORMS)) from error
 
 

@@ -33,7 +33,7 @@ def check_dry_run(dry_run: object) -> None:
     """Raise for an unknown kind of dry run, so that a typing error cannot open hardware.
 
     Raises:
-        ConfigError: It is unknown.
+        ConfigError: The kind is unknown.
     """
     if dry_run not in get_args(DryRun):
         raise ConfigError(
@@ -48,14 +48,14 @@ class Options:
     Attributes:
         profile: Name or path of the profile, instead of the sequence's own.
         shots: Number of shots, instead of the sequence's own.
-        seed: Seed, instead of the sequence's own or a fresh one.
-        overrides: ``"address=value"`` strings, as given to ``--set``; they take precedence.
+        seed: Seed, instead of the sequence's own or a new one.
+        overrides: ``"address=value"`` strings, as given to ``--set``. They take precedence.
         output: Folder for the data, instead of LABSEQ_DATA or ``./data``.
-        dry_run: "full": every device by its simulator if its plugin has one, else by its virtual twin;
-            "fast": virtual twins only; or "off".
+        dry_run: With "full", a device is replaced by its plugin's simulator, or else by its virtual twin.
+            "fast" uses virtual twins only. "off" uses the devices.
         realtime: Let virtual time pass at the speed of real time.
         note: A note about the run, for people.
-        tags: Words to find the run by.
+        tags: Words for finding the run.
     """
 
     profile: str | Path | None = None
@@ -76,7 +76,7 @@ class Options:
 
     @classmethod
     def of(cls, changes: Mapping[str, Any], *, realtime: bool = False) -> Self:
-        """Options from their changes; the inverse of :meth:`changes`."""
+        """Options from their changes, the inverse of :meth:`changes`."""
         own = {key: int(changes[key]) for key in ("shots", "seed") if str(changes.get(key)).isdecimal()}
         return cls(
             profile=changes.get("profile"),
@@ -95,7 +95,7 @@ class Options:
         ]
 
     def changes(self) -> dict[str, str]:
-        """Everything that differs from the files: address -> value, as it was typed."""
+        """Everything that differs from the files: address -> value, as typed."""
         changed: dict[str, str] = {override.address: override.value for override in self.own()}
         changed |= dict(item.split("=", 1) for item in self.overrides)
         if self.profile is not None:

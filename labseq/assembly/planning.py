@@ -49,13 +49,13 @@ class PlanRequest:
 
     Attributes:
         occupancy: See :func:`labseq.assembly.occupancies.read_source`.
-        target: See :func:`read_target`; None for the target that a shot was taken with.
+        target: See :func:`read_target`. None for the target of the shot.
         planner: Its name.
-        degree_of_parallelism: The planner's setting of that name; None for its default.
-        overrides: ``"key=value"`` each: further settings of the planner, with or
-            without "planner." before the key; after "profile.", values of the profile.
-        seed: Seed of a drawn occupancy; None for a fresh one.
-        origin: "R,C", the top left site of the target; None for the pattern's own.
+        degree_of_parallelism: The planner's setting of that name. None for its default.
+        overrides: ``"key=value"`` for each further setting of the planner, with or without "planner." before
+            the key, and for values of the profile with "profile.".
+        seed: Seed of a drawn occupancy. None for a new seed.
+        origin: "R,C", the top left site of the target. None for the pattern's own.
         profile: Name or path of a profile for grid, motion and plugin folders.
     """
 
@@ -81,8 +81,8 @@ def read_inputs(request: PlanRequest, source: Source) -> PlanInputs:
     """Read and validate all files and settings that a request names.
 
     Raises:
-        ConfigError: An argument is invalid; says what was expected.
-        PluginLoadError: A plugin that is named failed to load.
+        ConfigError: An argument is invalid. The message says what was expected.
+        PluginLoadError: A named plugin failed to load.
     """
     for_planner, for_profile = split_overrides(request.overrides)
     machine, folders = read_machine(request, for_profile, source)
@@ -102,8 +102,8 @@ def read_machine(
 
     Args:
         request: Names the profile, if there is one.
-        overrides: Values that replace those of the profile.
-        source: The occupancy; without a profile, the profile of its shot is used.
+        overrides: Values that replace values of the profile.
+        source: The occupancy. Without a profile, the profile of its shot is used.
 
     Raises:
         ConfigError: The profile has an error, or its grid has another shape.
@@ -111,7 +111,7 @@ def read_machine(
     shape = source.occupancy.shape
     if request.profile is None:
         if overrides:
-            raise ConfigError(Problem("there is no --profile to change", overrides[0].source))
+            raise ConfigError(Problem("--profile is missing", overrides[0].source))
         return _default_machine(source), []
     document, spec = load_profile(request.profile, overrides=overrides)
     grid, motion = calibrated_machine(document, spec)
@@ -123,7 +123,7 @@ def read_machine(
 
 
 def _default_machine(source: Source) -> Machine:
-    """Grid and motion of the shot that the occupancy is from; else the paper's spacing and motion."""
+    """Grid and motion of the occupancy's shot, or else the paper's spacing and motion."""
     if source.machine is None:
         n_rows, n_cols = source.occupancy.shape
         return Machine(SiteGrid(n_rows, n_cols), MotionSpec())
@@ -131,21 +131,21 @@ def _default_machine(source: Source) -> Machine:
 
 
 def _recorded_target(request: PlanRequest, source: Source) -> TargetPattern:
-    """The target of the shot that the occupancy is from."""
+    """The target of the occupancy's shot."""
     if source.target is None:
         raise ConfigError(Problem("--target is missing", expected=_TARGET_FORMS))
     if request.origin is not None:
-        raise ConfigError(Problem("there is no --target to move", clean(f"--origin {request.origin}")))
+        raise ConfigError(Problem("--origin needs --target", clean(f"--origin {request.origin}")))
     return source.target
 
 
 class TargetChoice(NamedTuple):
-    """A target that a command names, not made yet.
+    """A target named in a command, before it is made.
 
     Attributes:
         document: The sequence or the option that names its pattern.
         choice: The pattern, and the location of its settings.
-        plugin_folders: The folders of plugins that the sequence names.
+        plugin_folders: The plugin folders of the sequence.
     """
 
     document: Document
@@ -157,7 +157,7 @@ class TargetChoice(NamedTuple):
 
         Raises:
             ConfigError: The pattern or a setting is wrong, or the target does not fit on the grid.
-            PluginLoadError: The pattern's plugin failed; names it.
+            PluginLoadError: The pattern's plugin failed. The message names it.
         """
         pattern = resolve(host, self.document, "pattern", self.choice)
         try:
@@ -215,7 +215,7 @@ def _planner(host: PluginHost, request: PlanRequest, settings: Sequence[Override
     for setting in settings:
         address = f"planner.{setting.address.removeprefix('planner.')}"
         overrides.append(Override(address, setting.value, setting.source))
-    # a document of options, so that a message names the option that is wrong
+    # a document of options, so that messages name the wrong option
     document = Document.of_options(overrides, "the command line")
     return resolve(host, document, "planner", Choice(use=request.planner).placed("planner"))
 
@@ -225,7 +225,7 @@ def construct_planner(chosen: ChosenPlugin, context: Context, seed: int = 0) -> 
 
     Raises:
         ConfigError: Its constructor refuses its settings.
-        PluginLoadError: Its constructor raised, or made no planner; names the plugin.
+        PluginLoadError: Its constructor raised, or made no planner. The message names the plugin.
     """
     objects, _ = construct({"planner": chosen}, context, seed)
     return objects["planner"], parallelism_of(chosen, objects["planner"], context.motion)
@@ -233,7 +233,7 @@ def construct_planner(chosen: ChosenPlugin, context: Context, seed: int = 0) -> 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedMoves:
-    """A checked plan and everything it was made from.
+    """A checked plan with its inputs.
 
     Attributes:
         source: Origin of the occupancy, for messages.
@@ -243,12 +243,12 @@ class PlannedMoves:
         motion: How the mobile tweezers move.
         planner: Name of the planner.
         settings: Its settings that differ from the defaults, SI, JSON-ready.
-        degree_of_parallelism: Maximum number of tweezers on at once, which the plan was checked for.
-        seed: Seed of all random numbers, drawn or given; None if there is none.
+        degree_of_parallelism: Maximum number of tweezers on at once in the check of the plan.
+        seed: Seed of all random numbers, drawn or given. None if there is none.
         plan: The plan.
-        report: Result of the check; of a refused plan, that of the batches before the refused one.
-        choice: What the planner chose for the target, then the alternatives; empty if it has no choice.
-        refused: The rule that the plan breaks in a batch; None for a valid plan.
+        report: Result of the check. For a refused plan, the result for the batches before the refused one.
+        choice: The planner's choice for the target, then the alternatives. Empty if it has no choice.
+        refused: The rule that the plan breaks in a batch. None for a valid plan.
     """
 
     source: str
@@ -272,12 +272,12 @@ class PlannedMoves:
 
     @property
     def n_filled(self) -> int:
-        """Target sites that hold an atom after the plan."""
+        """Number of target sites with an atom after the plan."""
         return self.target.n_atoms - self.report.n_defects
 
     @property
     def n_ejected(self) -> int:
-        """Atoms that leave the grid."""
+        """Number of atoms that leave the grid."""
         return int(self.occupancy.sum()) - int(self.report.predicted.sum())
 
     @property
@@ -287,7 +287,7 @@ class PlannedMoves:
 
     @property
     def survival(self) -> Survival:
-        """Prediction of what the plan costs, by the losses of the profile."""
+        """Predicted survival for the plan, from the losses of the profile."""
         plan = self.plan if self.refused is None else self.plan.first(self.refused.batch)
         return predict_survival(plan, self.report, self.occupancy, self.target, self.grid, self.motion)
 
@@ -303,13 +303,13 @@ def plan_moves(
     """Plan once, and check the plan as a run does.
 
     Args:
-        announce: Called before kernels are compiled, with roughly how long that takes in seconds.
-        keep_refused: Whether a plan that breaks a rule in one of its batches is returned, too.
+        announce: Called before kernels are compiled, with the approximate compilation time in seconds.
+        keep_refused: Whether to return also a plan that breaks a rule in one of its batches.
         once: Whether this process plans only once.
 
     Raises:
-        ConfigError: The request has an error; says what was expected.
-        PluginLoadError: A plugin that is named failed to load.
+        ConfigError: The request has an error. The message says what was expected.
+        PluginLoadError: A named plugin failed to load.
         PlanError: The planner failed, or its plan breaks a rule.
     """
     source = source or read_source(request.occupancy, request.seed)
@@ -317,7 +317,7 @@ def plan_moves(
     inputs = read_inputs(request, source)
     grid, motion, target = inputs.machine.grid, inputs.machine.motion, inputs.target
     planner, dop = construct_planner(inputs.planner, Context(grid=grid, motion=motion), seed or 0)
-    # planning once in plain Python is faster than loading numba, but choosing plans a hundred times
+    # a single plan in plain Python is faster than loading numba, but a choice makes a hundred plans
     if once and occupancy.size <= 64 * 64 and not isinstance(planner, ChoosesPlanner):
         interpret()
     with announcing(announce):
@@ -326,7 +326,7 @@ def plan_moves(
         try:
             report = check_plan(plan, occupancy, target, dop, grid, motion, request.planner)
         except InvalidPlanError as error:
-            # a plan that is wrong as a whole has no first batches that could be shown
+            # if a plan is wrong as a whole, it has no first batches to show
             if not keep_refused or error.batch < 0:
                 raise
             refused, before = error, plan.first(error.batch)
@@ -349,7 +349,7 @@ def plan_moves(
 
 
 MAX_PLAN_S: Final = 60.0
-"""Maximum time for a plan outside of a run, whose kernels may be interpreted."""
+"""Maximum time for a plan outside of a run, in seconds. Its kernels may be interpreted."""
 
 
 def call_planner(
@@ -358,10 +358,10 @@ def call_planner(
     """Call a planner with a copy of the occupancy, in case the planner changes its input.
 
     Args:
-        guard: Calls it; without one, a new one.
+        guard: Guard of the call. None for a new guard.
 
     Raises:
-        PlanError: The planner raised, or did not return in time; names the planner.
+        PlanError: The planner raised, or did not return in time. The message names the planner.
     """
     own = guard or Guard()
     try:

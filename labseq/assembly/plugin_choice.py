@@ -1,4 +1,4 @@
-"""A plugin that a file names: found in the registry, its settings validated, its object constructed."""
+"""Finds the plugins that a file names, validates their settings and constructs their objects."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ChosenPlugin:
-    """A registry entry and the settings it will be constructed with.
+    """A registry entry with the settings for its constructor.
 
     Attributes:
         entry: Entry of the plugin in the registry.
-        settings: Its settings; None if it takes none.
-        document: The file that chose it; None if no file did.
+        settings: Its settings. None if it takes none.
+        document: The file that chose it. None if no file did.
         loc: Location of its settings in that file.
-        by_line: Whether a line of the profile triggers it, whatever its setting ``trigger`` is.
+        by_line: Whether a line of the profile triggers it, whatever its setting ``trigger`` says.
     """
 
     entry: Entry
@@ -57,16 +57,16 @@ class ChosenPlugin:
 
     @cached_property
     def virtual_time(self) -> bool:
-        """Whether the plugin needs no real time: always, or with its present settings."""
+        """Whether the plugin needs no real time, at least with its present settings."""
         simulated = self.entry.simulated
         if self.entry.virtual_time or simulated is None or self.settings is None:
             return self.entry.virtual_time
-        # a setting that simulates the device may be written in the profile itself
+        # the profile itself may contain a setting that simulates the device
         update = {key: value for key, value in simulated.items() if key != "trigger" or not self.by_line}
         return self.settings.model_copy(update=update) == self.settings
 
     def identities(self, role: str) -> tuple[str, ...]:
-        """What only one process can use, of the hardware of a role; () if all of it is simulated."""
+        """Names of hardware of a role that only one process can use, or () if all is simulated."""
         if self.virtual_time:
             return ()
         identities = None
@@ -74,7 +74,7 @@ class ChosenPlugin:
             identities = None if self.settings is None else self.settings.identities()
         if identities is not None:
             return tuple(map(str, identities))
-        # a driver that does not say which device it uses: one run at a time on the profile
+        # if a driver does not say which device it uses, the profile allows one run at a time
         return (f"{role} of {'' if self.document is None else self.document.path.resolve()}",)
 
     def dump(self) -> dict[str, Any]:
@@ -101,8 +101,8 @@ def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> 
     """Find the plugin named in a file, and validate its settings.
 
     Raises:
-        ConfigError: Unknown name, a plugin that failed to load, or wrong settings, with file, line
-            and column.
+        ConfigError: The name is unknown, the plugin failed to load, or its settings are wrong. The error has
+            file, line and column.
     """
     loc = choice.loc
     entry = find_entry(host, document, kind, choice.use, (*loc, choice.key))
@@ -114,7 +114,7 @@ def resolve(host: PluginHost, document: Document, kind: str, choice: Choice) -> 
 
 
 def _with_advice(error: ConfigError, document: Document, choice: Choice) -> ConfigError:
-    """Add how to drop settings that the file has for another plugin, if an option chose this one."""
+    """Explain how to drop settings of another plugin in the file, if an option chose this plugin."""
     if document.root.mark_at((*choice.loc, choice.key)).line:
         return error
     prefix = addresses.PROFILE if choice.loc[0] in (*addresses.PROFILE_ROLES, *addresses.NAMED) else ""
@@ -134,10 +134,10 @@ def find_entry(
     """Find the registry entry of a plugin named in a file.
 
     Args:
-        key: Whether the name is the key there.
+        key: Whether the name is the key at ``loc``.
 
     Raises:
-        ConfigError: No plugin offers it, or the one that does failed to load.
+        ConfigError: No plugin offers the name, or its plugin failed to load.
     """
     try:
         return host.get(kind, name, document.path)
@@ -151,13 +151,13 @@ def find_entry(
 def read_settings(
     document: Document, entry: Entry, loc: Loc, core_keys: Collection[str] = ()
 ) -> Settings | None:
-    """The settings of an entry, validated; None if it takes none.
+    """The validated settings of an entry, or None if it takes none.
 
     Args:
         core_keys: Keys of the mapping that labseq reads itself.
 
     Raises:
-        ConfigError: They are invalid, or the plugin's own validators fail; with their place.
+        ConfigError: They are invalid, or the plugin's own validators fail. The error has their place.
     """
     called = f"{entry.kind.replace('_', ' ')} '{entry.name}'"
     try:
@@ -191,10 +191,10 @@ def changed_settings(settings: Settings | None) -> dict[str, Any]:
 
 
 def load_plugins(folders: Sequence[Path] = (), max_wait_s: float = LOAD_S) -> PluginHost:
-    """Load labseq's own, the installed and the folders' plugins; every command finds them by this function.
+    """Load labseq's own plugins, installed plugins and plugins from folders, for every command.
 
     Args:
-        folders: The folders that profile and sequence name; --plugins and LABSEQ_PLUGIN_PATH are added.
+        folders: The folders from profile and sequence. --plugins and LABSEQ_PLUGIN_PATH are added.
         max_wait_s: Maximum time for a plugin to load, and for a constructor, in seconds.
 
     Raises:
@@ -208,11 +208,11 @@ def load_plugins(folders: Sequence[Path] = (), max_wait_s: float = LOAD_S) -> Pl
 
 
 def construct_one(chosen: ChosenPlugin, context: Context | ScanSpace) -> Any:
-    """Construct the object of one role; a scanner receives the ranges that it may choose from.
+    """Construct the object of one role. A scanner receives its ranges.
 
     Raises:
-        ConfigError: Its constructor refuses its settings, raised, or made no object of that role; with their
-            place, and the name of the plugin.
+        ConfigError: The constructor refuses its settings, raised, or made no object of that role. The error
+            has the place of the settings and the name of the plugin.
     """
     try:
         return construct_role(chosen.entry, chosen.settings, context)
@@ -228,8 +228,8 @@ def construct_role(entry: Entry, *arguments: Any) -> Any:
         *arguments: The factory's arguments.
 
     Raises:
-        LabseqError: The factory raised this one.
-        PluginLoadError: It raised something else, did not return in time, or made no object of that role.
+        LabseqError: The factory raised this error.
+        PluginLoadError: It raised another error, did not return in time, or made no object of that role.
     """
 
     def make() -> Any:
@@ -245,7 +245,7 @@ def construct_target(chosen: ChosenPlugin, grid: SiteGrid) -> TargetPattern:
 
     Raises:
         LabseqError: The pattern refuses, for example because it does not fit on the grid.
-        PluginLoadError: The pattern's plugin failed; names it.
+        PluginLoadError: The pattern's plugin failed. The message names it.
     """
     entry = chosen.entry
     target = call_plugin(entry.owner, f"pattern '{entry.name}'", lambda: entry.factory(chosen.settings, grid))
@@ -259,8 +259,8 @@ def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> 
     """A step of a sequence, and its settings for the record.
 
     Raises:
-        ConfigError: The step is unknown, its settings are invalid, or the profile lacks the device that it
-            names; with their place.
+        ConfigError: The step is unknown, its settings are invalid, or the profile lacks its device. The error
+            has their place.
     """
     entry = find_entry(hardware.host, document, "step", spec.kind, spec.loc, key=True)
     _check_indentation(document, spec, entry)
@@ -275,13 +275,13 @@ def make_step(hardware: ResolvedProfile, document: Document, spec: StepSpec) -> 
 
 
 def _check_indentation(document: Document, spec: StepSpec, entry: Entry) -> None:
-    """Raise for keys of the item of the list that are indented as settings of the step are."""
+    """Raise for keys of the list item that are indented like settings of the step."""
     settings = {setting.key for setting in settings_of(entry.settings_model)}
     for key in ("name", "policy"):
         if key not in settings and document.root.at((*spec.loc, key)) is not None:
             what = f"'{key}' is in the settings of '{spec.kind}'"
             hint = f"write '{key}' on a line of its own below"
-            raise document.error((*spec.loc, key), what, f"'{key}' beside '{spec.kind}'", hint, key=True)
+            raise document.error((*spec.loc, key), what, f"'{key}' next to '{spec.kind}'", hint, key=True)
 
 
 def _check_device(
@@ -303,16 +303,16 @@ def _check_device(
 
 
 def place_note(document: Document, key: str) -> str:
-    """The note of a problem that names the place of a key in the other file."""
+    """A note for a problem, with the place of a key in another file."""
     line, column = document.locate((key,), key=True)
     return f"see '{key}' at {document.path}:{line}:{column}"
 
 
 def check_role(entry: Entry, instance: object) -> None:
-    """Raise if an object cannot play its role; from then on its methods are called without asking.
+    """Raise if an object lacks the base class or methods of its role. Later calls do not check again.
 
     Raises:
-        PluginLoadError: It is not of the role's base class, or lacks its method.
+        PluginLoadError: It is not of the role's base class, or lacks a method.
     """
     base = entry.role.base
     called, see = f"{entry.kind} '{entry.name}'", f"see labseq.plugin.{base.__name__}"
@@ -327,7 +327,7 @@ def check_role(entry: Entry, instance: object) -> None:
             )
             raise entry.owner.fault(f"{text}; {see}")
         return
-    # a Protocol: planners and others without state need no base class, only the method
+    # a Protocol, because planners and others without state need no base class, only the method
     methods = [name for name in vars(base) if not name.startswith("_")]
     if missing := [name for name in methods if not callable(getattr(instance, name, None))]:
         raise entry.owner.fault(f"{called} has no method {', '.join(missing)}; {see}")

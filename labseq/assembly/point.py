@@ -1,4 +1,4 @@
-"""The settings of a run at one point of its scan, and the steps among them."""
+"""The settings and steps of a run at one point of its scan."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Point:
         hardware: The profile.
         parameters: Scanned address -> value, SI, JSON-ready.
         document: The sequence's file with the values of the point.
-        target: The target; None for that of the run.
+        target: The target. None for the target of the run.
     """
 
     planner: ChosenPlugin
@@ -37,5 +37,5 @@ class Point:
 
     @property
     def lab_key(self) -> tuple[int, int]:
-        """The same for points that need the same devices and planner, as long as these points exist."""
+        """A key that is equal for points with the same devices and planner, as long as the points exist."""
         return id(self.planner), id(self.hardware)

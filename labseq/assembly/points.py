@@ -1,8 +1,8 @@
-"""The settings of a run at each point of its scan: values put into the files, and validated as those are.
+"""The settings of a run at each point of its scan, validated like the files themselves.
 
-A scan has many points, but few different settings: those of a plugin are validated once for each content
-that the points give them. Devices are constructed later, when the run opens or by ``labseq check``; between
-two points only those are constructed again whose settings differ.
+A scan has many points but few different settings, so each different content of a plugin's settings is
+validated once. Devices are constructed later, when the run opens or by ``labseq check``. Between two points
+only devices whose settings differ are constructed again.
 """
 
 from __future__ import annotations
@@ -58,20 +58,20 @@ class ScanPoints:
     _known: dict[Any, Any] = field(default_factory=dict[Any, Any], repr=False)
 
     def check(self, problems: ProblemCollector) -> None:
-        """Validate the settings at every point; of an adaptive scan, at the corners of its ranges.
+        """Validate the settings at every point, or for an adaptive scan at the corners of its ranges.
 
         Args:
-            problems: Receives the problems; after :data:`MAX_PROBLEMS` no further point is tried.
+            problems: Receives the problems. After :data:`MAX_PROBLEMS` no further point is tried.
         """
         try:
             self._check_dependents()
         except ConfigError as error:
             problems.add(error)
             return
-        # at each point, the errors that are there anyway would come once more
+        # the errors that are already known would occur again at each point
         known = set(self.scan.explained(ConfigError(problems.problems)).problems)
         n_before = len(problems.problems)
-        # of an adaptive scan these are the corners of its ranges
+        # for an adaptive scan, the points are the corners of its ranges
         for number in range(math.prod(self.scan.shape)):
             try:
                 self.at(number)
@@ -83,10 +83,10 @@ class ScanPoints:
                 return
 
     def at(self, number: int) -> Point:
-        """The settings of a point, by its number; of an adaptive scan, of a corner of its ranges.
+        """The settings of a point, by its number, or of a corner of the ranges of an adaptive scan.
 
         Raises:
-            ConfigError: All that plugins refuse of the values.
+            ConfigError: All values that plugins refuse.
         """
         return self._once(number, lambda: self.with_values([*self.scan.values(number)]))
 
@@ -94,7 +94,7 @@ class ScanPoints:
         """The settings with a value for each axis.
 
         Raises:
-            ConfigError: All that plugins refuse of the values.
+            ConfigError: All values that plugins refuse.
         """
         problems, hardware, plugins = ProblemCollector(), self.hardware, dict[Loc, Configured[Any]]()
         document = put(values, self.document, profile=False)
@@ -121,8 +121,8 @@ class ScanPoints:
     def record(self, point_of_shot: Sequence[int]) -> dict[str, Any]:
         """The scan for the run's record, JSON-ready.
 
-        ``addresses``: the scanned addresses; ``points``: the values of each point, SI; ``written``: the
-        same in the units of the sequence; ``point_of_shot``: the point of each shot, counted from 0.
+        ``addresses`` are the scanned addresses, ``points`` the values of each point in SI, ``written`` the
+        same in the units of the sequence, and ``point_of_shot`` the point of each shot, counted from 0.
         """
         numbers, addresses = range(self.scan.n_points), [axis.address for axis in self.scan.axes]
         at = [self.at(number).parameters for number in numbers]
@@ -136,7 +136,7 @@ class ScanPoints:
         }
 
     def present(self, axis: Axis) -> Any:
-        """The value of an axis in the files, SI; None if it is missing."""
+        """The value of an axis in the files, SI. None if it is missing."""
         if axis.loc[0] == VARIABLES:
             return _si((self.hardware.document if axis.of_profile else self.document).get(axis.loc))
         return _setting(self._planner_and_steps(self.document), self.hardware, axis.of_profile, axis.loc)
@@ -145,18 +145,18 @@ class ScanPoints:
         """Planner and steps by the place of their settings.
 
         Raises:
-            ConfigError: All that they refuse.
+            ConfigError: All values that they refuse.
         """
         problems, plugins = ProblemCollector(), dict[Loc, Configured[Any]]()
         for loc in (_PLANNER, *(spec.loc for spec in self.sequence.shot)):
             with problems:
-                key = loc, json.dumps(document.get(loc))  # as text: settings are mappings, which are not keys
+                key = loc, json.dumps(document.get(loc))  # as text, because mappings cannot be keys
                 plugins[loc] = self._once(key, partial(self._make, document, loc))
         problems.raise_any()
         return plugins
 
     def _profile_with(self, values: Sequence[tuple[Axis, Node]]) -> ResolvedProfile:
-        """The profile with the values of a point; points with the same values share one object."""
+        """The profile with the values of a point. Points with the same values share one object."""
         own = [node.plain() for axis, node in values if axis.of_profile]
         if not own:
             return self.hardware
@@ -174,11 +174,11 @@ class ScanPoints:
         return make_step(self.hardware, document, self.sequence.shot[int(loc[1])])
 
     def _once(self, key: object, make: Callable[[], T]) -> T:
-        """What a function makes, or the error that it raises: worked out once for each key."""
+        """The result of a function, or the error that it raises. It is called once for each key."""
         if key not in self._known:
             try:
                 self._known[key] = make()
-            except ConfigError as error:  # kept, too: many points may share a wrong value
+            except ConfigError as error:  # kept too, as many points may share a wrong value
                 self._known[key] = error
         if isinstance(self._known[key], ConfigError):
             raise self._known[key]
@@ -197,7 +197,7 @@ class ScanPoints:
         return loc[0] == "planner" or (loc[0] == "shot" and len(loc) > 3)
 
     def _check_dependents(self) -> None:
-        """Raise for an axis that changes no setting, or a setting that must be the same in the whole run."""
+        """Raise for an axis that changes no setting, or that changes a setting which a scan cannot change."""
         for axis in self.scan.axes:
             dependents, own = self._dependents(axis), clean(axis.address)
             if axis.loc[0] == VARIABLES and not dependents:
@@ -207,18 +207,18 @@ class ScanPoints:
             for loc in dependents:
                 if not self._may_change(axis.of_profile, loc):
                     other = clean(_address(axis.of_profile, loc))
-                    what = f"'{other}' depends on '{own}', and a scan cannot change it"
-                    raise axis.key.error(what, "one value of it for the whole run")
+                    what = f"a scan cannot change '{other}', which depends on '{own}'"
+                    raise axis.key.error(what, "one value for the whole run")
 
 
 def _changed(hardware: ResolvedProfile, document: Document) -> ResolvedProfile:
-    """A profile with other settings of its plugins; drivers, grid and calibrations stay the same.
+    """A profile with other settings of its plugins, but the same drivers, grid and calibrations.
 
     Args:
         document: The profile's file with the other settings.
 
     Raises:
-        ConfigError: All that is wrong with them.
+        ConfigError: All errors in the settings.
     """
     problems, chosen, profile = ProblemCollector(), dict(hardware.chosen), hardware.profile
     for role, choice in {**profile.choices, **profile.devices}.items():
@@ -249,7 +249,7 @@ def _address(of_profile: bool, loc: Loc) -> str:
 def _setting(
     plugins: Mapping[Loc, Configured[Any]], hardware: ResolvedProfile, of_profile: bool, loc: Loc
 ) -> Any:
-    """The value at a location after the plugin's validation, SI; None if it is missing."""
+    """The value at a location after the plugin's validation, SI, or None if it is missing."""
     if loc[0] == VARIABLES:
         return None
     n = 2 if loc[0] == "devices" else 3 if loc[0] == "shot" else 1
@@ -268,16 +268,15 @@ def _si(value: Any) -> Any:
 
 
 DRIVERS_MOTION: Final = frozenset({"rf", "max_row_tones", "max_column_tones", "eject_slots"})
-"""Keys of the motion that mobile tweezers need when they are opened; only the core uses the others."""
+"""Keys of the motion that mobile tweezers need when they are opened. Only the core uses the others."""
 
 
 def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, frozenset[str]]:
-    """Construct the objects whose settings differ between two points; all others stay open.
+    """Construct the objects whose settings differ between two points. All others stay open.
 
-    A device whose settings change must be closed first and reopened afterwards. The mobile
-    tweezers stay open if the motion differs only in what each program contains. A
-    simulated lab stays open only if nothing of its devices and of the motion differs: its devices hold
-    on to the simulation, and that to the motion.
+    A device whose settings change must be closed first and reopened afterwards. The mobile tweezers stay open
+    if only the contents of their programs differ. A simulated lab stays open only if none of its devices and
+    nothing in the motion differs, because its devices refer to the simulation, which refers to the motion.
 
     Args:
         lab: The lab at the previous point.
@@ -285,7 +284,7 @@ def rebuild_lab(lab: Lab, before: Point, after: Point, seed: int) -> tuple[Lab, 
         after: The next point.
 
     Returns:
-        The lab, and the names of the devices that must be reopened, "simulation" among them.
+        The lab, and the names of the devices that must be reopened, including "simulation".
     """
     reopened = _reopened(lab, before.hardware, after.hardware)
     motion = after.hardware.motion
@@ -332,6 +331,6 @@ def _differs(before: ResolvedProfile, after: ResolvedProfile, name: str) -> bool
 
 
 def _streams(old: tuple[RandomStream, ...], new: tuple[RandomStream, ...]) -> tuple[RandomStream, ...]:
-    """Random streams of a lab: those of new objects, and the earlier ones of objects that stay."""
+    """Random streams of a lab, from its new objects and from objects that stay."""
     names = {stream.name for stream in new}
     return (*(stream for stream in old if stream.name not in names), *new)

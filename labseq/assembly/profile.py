@@ -1,4 +1,4 @@
-"""The profile with its plugins and calibrations, found and validated; nothing is opened."""
+"""Finds and validates a profile with its plugins and calibrations. Nothing is opened."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ResolvedProfile:
         dry_run: "off", "full" or "fast".
         host: The plugins.
         grid: The grid of sites, with calibrated tones.
-        chosen: Role or device name -> its plugin; without the planner.
+        chosen: Role or device name -> its plugin, without the planner.
         warnings: For the user.
         refused: Role or device name -> why no plugin could be chosen.
         calibrations: The calibrations in use: kind -> entry.
@@ -75,12 +75,12 @@ class ResolvedProfile:
 
     @property
     def motion(self) -> MotionSpec:
-        """How the mobile tweezers move, with calibrated amplitudes and the time that they take to start.
+        """Motion of the mobile tweezers, with calibrated amplitudes and starting time.
 
-        Without a calibration or a value in the profile, that time is what the driver's settings say it takes.
+        Without a calibration or a value in the profile, the starting time is the typical value of the driver.
         """
         motion, mobile = self.profile.motion, self.profile.mobile_tweezers
-        driver = self.chosen.get("mobile_tweezers")  # None if it has an error, and others are made safe
+        driver = self.chosen.get("mobile_tweezers")  # None if it has an error while others are made safe
         typical_s = getattr(driver and driver.settings, "overhead_per_cycle_s", None)
         if typical_s is not None and "overhead_per_cycle_s" not in mobile.model_fields_set:
             motion = replace(motion, overhead_per_cycle_s=typical_s)
@@ -95,19 +95,19 @@ class ResolvedProfile:
 
     @property
     def key(self) -> str:
-        """The profile's name in the markers of active runs; a dry run, which touches nothing, has another."""
+        """The profile's name in the markers of active runs. A dry run has another, as it uses no device."""
         path = str(self.document.path.resolve())
         return path if self.dry_run == "off" else f"{path} (dry run)"
 
     @cached_property
     def drivers(self) -> Mapping[str, ChosenPlugin]:
-        """Role or device name -> its plugin; without the detector and the simulation."""
+        """Role or device name -> its plugin, without the detector and the simulation."""
         return {role: plugin for role, plugin in self.chosen.items() if plugin.entry.role.is_hardware}
 
     @cached_property
     def identities(self) -> Mapping[str, str]:
-        """What only one process can use of its hardware -> the role or device that uses it."""
-        # asked once: a run must unlock what it has locked, whatever a plugin answers later
+        """Name of hardware that only one process can use -> the role or device that uses it."""
+        # cached, because a run must unlock what it has locked, whatever a plugin answers later
         return {
             identity: role for role, plugin in self.drivers.items() for identity in plugin.identities(role)
         }
@@ -122,7 +122,7 @@ def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, problem
     """Find lines that are on during unknown steps."""
     channels = {} if spec.lines is None else spec.lines.channels
     if not any(channel.on for channel in channels.values()):
-        return  # without loading the modules of all steps
+        return  # avoids loading the modules of all steps
     registry = host.registry
     entries = {name: registry.find("step", name) for name in registry.names("step")}
     steps = [name for name, entry in entries.items() if entry and getattr(entry.factory, "takes_time", True)]
@@ -138,11 +138,11 @@ def check_kinds(document: Document, spec: ProfileSpec, host: PluginHost, problem
 
 
 def check_dead_time(document: Document, spec: ProfileSpec, problems: ProblemCollector) -> None:
-    """Find a dead time before each batch of tweezers that are not virtual: they would play it as silence."""
+    """Report a dead time before each batch for tweezers that are not virtual and would play silence."""
     mobile = spec.mobile_tweezers
     if mobile.motion.overhead_per_batch_s and not mobile.use.startswith(VIRTUAL_TWIN):
         what = f"a dead time before each batch is set for '{clean(mobile.use)}', which would play silence"
-        expected = "none: batches follow each other, and only `use: virtual` models a setup that cannot do so"
+        expected = "none, as only `use: virtual` models a setup with dead times"
         problems.add(document.error(("mobile_tweezers", "overhead_per_batch"), what, expected, key=True))
 
 
@@ -161,13 +161,13 @@ def resolve_profile(
 
     Args:
         named_in: The sequence that names the profile.
-        plugin_folders: Folders with plugins that come before the profile's: those of the sequence.
-        problems: Receives those of a readable profile; without it they are raised.
-        recorded: The profile's text and calibrations, of a run that began earlier.
+        plugin_folders: Plugin folders of the sequence, which come before the profile's folders.
+        problems: Receives the problems of a readable profile. Without it they are raised.
+        recorded: The profile's text and calibrations, if the run began earlier.
 
     Raises:
         ConfigError: The profile has an error.
-        PluginLoadError: A plugin that it names failed to load.
+        PluginLoadError: A plugin of the profile failed to load.
     """
     document, spec = load_profile(
         profile,
@@ -177,7 +177,7 @@ def resolve_profile(
         problems=problems,
         kept=None if recorded is None else recorded.profile,
     )
-    # of two plugins of one name the first is loaded
+    # if two plugins have the same name, the first is loaded
     folders = [*plugin_folders, *plugin_paths(document, spec.plugin_folders)]
     host = load_plugins(folders, max_wait_s=spec.timeouts.load_s)
     pins = None if recorded is None else recorded.calibrations
@@ -197,14 +197,14 @@ def choose_plugins(
 
     Args:
         spec: Its content, with fallbacks for wrong values.
-        calibrations: Kind -> id of the active ones; None for those chosen by profile and store.
+        calibrations: Kind -> id of the active calibration. None for the choice of profile and store.
     """
     repaired = bool(problems.problems)
     chosen: dict[str, ChosenPlugin] = {}
     warnings: list[str] = []
     refused: dict[str, ConfigError] = {}
     for role, choice in {**spec.choices, **spec.devices}.items():
-        if choice.loc in document.replaced:  # its problem is reported; what is chosen here is a fallback
+        if choice.loc in document.replaced:  # its problem is reported, and this choice is a fallback
             refused[role] = ConfigError("its settings in the profile are invalid")
             continue
         try:
@@ -216,7 +216,7 @@ def choose_plugins(
     check_kinds(document, spec, host, problems)
     check_dead_time(document, spec, problems)
     detector = chosen["detector"].dump() if "detector" in chosen else {}
-    # calibrations need not fit a grid that stands in for a wrong one
+    # calibrations need not fit a fallback grid
     active = (
         ActiveCalibrations({}, spec.grid_model())
         if repaired
@@ -234,10 +234,10 @@ def choose(
     """The plugin of a role or device of a profile, and a warning for the user or "".
 
     Raises:
-        ConfigError: Unknown name, a plugin that failed to load, or wrong settings, with their place.
+        ConfigError: The name is unknown, the plugin failed to load, or its settings are wrong.
     """
     kind = choice.role if isinstance(choice, DeviceChoice) else role
-    # not of a further camera among the devices, whose kind is a role, too
+    # not for a further camera among the devices, whose kind is also the name of a role
     by_line = kind == role and trigger_line(spec.line_specs, role) is not None
     if dry_run == "off" or not ROLES[kind].has_twin or choice.use == VIRTUAL_TWIN:
         chosen, warning = resolve(host, document, kind, choice), ""
@@ -249,17 +249,17 @@ def choose(
 def _in_dry_run(
     host: PluginHost, document: Document, kind: str, choice: Choice, dry_run: DryRun
 ) -> tuple[ChosenPlugin, str]:
-    """The plugin with its simulated device, else its virtual twin; and a warning for the user or ""."""
-    if kind == "simulation":  # one at another computer has an identity, as hardware has
+    """The plugin with its simulated device or else its virtual twin, and a warning for the user or ""."""
+    if kind == "simulation":  # a simulation on another computer has an identity, like hardware
         chosen = resolve(host, document, kind, choice)
         elsewhere = chosen.settings is not None and chosen.settings.identities()
         return (_twin(host, document, kind, choice) if elsewhere else chosen), ""
     if dry_run == "fast":
         return _twin(host, document, kind, choice), ""
-    # so that a sequence can be tried on a computer without the machine's drivers
+    # lets a user try a sequence on a computer without the machine's drivers
     if absence := _absence(host, kind, choice.use):
         twin = _twin(host, document, kind, choice)
-        return twin, f"{absence}; its virtual twin takes its place and its settings were not checked"
+        return twin, f"{absence}; its virtual twin is used instead, and its settings were not checked"
     chosen = resolve(host, document, kind, choice)
     if chosen.entry.virtual_time:
         return chosen, ""
@@ -268,7 +268,7 @@ def _in_dry_run(
         return replace(chosen, settings=settings), ""
     reason = chosen.entry.no_simulator
     twin = _twin(host, document, kind, choice)
-    return twin, f"{reason}; its virtual twin takes its place" if reason else ""
+    return twin, f"{reason}; its virtual twin is used instead" if reason else ""
 
 
 def _twin(host: PluginHost, document: Document, kind: str, choice: Choice) -> ChosenPlugin:
@@ -279,7 +279,7 @@ def _twin(host: PluginHost, document: Document, kind: str, choice: Choice) -> Ch
 
 
 def _absence(host: PluginHost, kind: str, name: str) -> str:
-    """The reason why no plugin offers a name (it failed to load, or does not exist); "" if one does."""
+    """The reason why no plugin offers a name (it failed to load, or does not exist), or ""."""
     if host.registry.find(kind, name) is not None:
         return ""
     try:

@@ -1,4 +1,4 @@
-"""Whether the shots of a sequence have the quantities that its checks and its adaptive scan need."""
+"""Checks that shots of a sequence have the quantities that its checks and its adaptive scan need."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from labseq.sequencer.clock import CLOCK_SET, SLEPT
 _JUDGED: Final = frozenset(
     {"success", "filling_fraction", "n_defects", "n_surplus", "seen_defect_free_cycle"}
 )
-"""Quantities (results of a shot) that only shots with an image have."""
+"""Results that only shots with an image have."""
 _READING: Final = "reading."
 
 
 def readings_of(
     hardware: ResolvedProfile, steps: Sequence[tuple[str, Step]], *, is_whole: bool
 ) -> Iterator[str]:
-    """The readings that shots on a profile may have, by name; ending in "." if the rest is not known.
+    """The names of readings that shots on a profile may have. A name ends in "." if the rest is not known.
 
     Args:
         steps: The steps of a shot.
-        is_whole: Whether these are all, and no error in a file hides steps or devices.
+        is_whole: Whether the steps are complete, so that no error in a file hides steps or devices.
     """
-    if not is_whole or hardware.dry_run != "off":  # in a dry run others stand in for devices
+    if not is_whole or hardware.dry_run != "off":  # in a dry run others replace the devices
         yield _READING
     for name, plugin in hardware.drivers.items():
         factory = plugin.entry.factory
         polled: Collection[str] | None = getattr(plugin.settings, "polled", None)
         if polled is not None:
             yield from (f"{_READING}{name}.{value}" for value in polled)
-        # a factory that is a function does not tell whether its driver has a poll() of its own
+        # a factory function does not reveal whether its driver has its own poll()
         elif not isinstance(factory, type) or getattr(factory, "poll", None) is not Hardware.poll:
             yield f"{_READING}{name}."
     if "simulation" in hardware.chosen:
@@ -68,14 +68,14 @@ def check_quantity(
 
     Args:
         place: Place of its name in the file.
-        purpose: Its use: "to optimise".
+        purpose: Its use, such as "to optimise".
         steps: The steps of a shot, or None if some have errors.
-        results: Names of its readings and of the results of its analyses, "analysis.NAME.KEY";
-            "analysis.NAME." if its keys are not known.
-        target: The target; None if it has errors.
+        results: Names of its readings, and of the results of its analyses as "analysis.NAME.KEY", or
+            "analysis.NAME." if the keys are not known.
+        target: The target. None if it has errors.
 
     Raises:
-        ConfigError: No shot can have it.
+        ConfigError: No shot can have the quantity.
     """
     names = unique_names([step_name for step_name, _ in steps or ()])
     images = [image for image, (_, step) in zip(names, steps or (), strict=True) if step.takes_image]
@@ -91,17 +91,17 @@ def check_quantity(
         raise document.error(place, f"{what} {purpose}", expected, _analysis_hint(name, results) or hint)
     needs_image = name in _JUDGED or parse_name(name).kind in OF_IMAGES
     if needs_image and steps is not None and not images:
-        what = f"no shot has a {name}: it takes no image"
+        what = f"no shot has a {name}, because a shot takes no image"
         raise document.error(place, what, "an 'image' step in the shot, or another quantity")
     taken = [step for _, step in steps or () if step.takes_image]
-    # a step of a plugin may take several
+    # a step of a plugin may take several images
     if parse_name(name).kind == "survival" and len(taken) == 1 and isinstance(taken[0], ImageStep):
-        what = f"there is no '{clean(name)}' {purpose}: the shot has one image, '{clean(images[0])}'"
-        raise document.error(place, what, "two images, and survival from one to the other")
+        what = f"there is no '{clean(name)}' {purpose} because the shot has one image, '{clean(images[0])}'"
+        raise document.error(place, what, "two images, for survival from one to the other")
 
 
 def _analysis_hint(name: str, results: Iterable[str]) -> str:
-    """How to get the result of an analysis that the sequence does not list; "" for other names."""
+    """How to get the result of an analysis that the sequence does not list, or "" for other names."""
     split = split_result(name)
     if split is None or split[0] in {one[0] for one in map(split_result, results) if one}:
         return ""
@@ -113,8 +113,8 @@ def missing_quantity(shot: int, name: str, purpose: str, quantities: Iterable[st
 
     Args:
         name: Name of the quantity.
-        purpose: Its use: "to optimise".
-        quantities: Names of the quantities that it has.
+        purpose: Its use, such as "to optimise".
+        quantities: Names of the quantities that the shot has.
     """
     known = list(quantities)
     hint = did_you_mean(name, known) or f"it has {listing(known)}"
@@ -129,11 +129,11 @@ def check_checks(
     target: TargetPattern | None,
     problems: ProblemCollector,
 ) -> None:
-    """Check the checks of a sequence; arguments as for :func:`check_quantity`."""
+    """Validate the checks of a sequence, with the arguments of :func:`check_quantity`."""
     for number, check in enumerate(sequence.policy.checks):
         place = "policy", "checks", number
         with problems:
             check_quantity(document, (*place, "value"), check.value, "to check", steps, results, target)
         if check.then == "skip_point" and sequence.scan is None:
-            what = "there is no scan whose points could be skipped"
+            what = "without a scan there are no points to skip"
             problems.add(document.error((*place, "then"), what, "'warn' or 'stop'"))

@@ -27,14 +27,14 @@ from labseq.settings import settings_of
 
 
 def resolved_of(run: Run) -> dict[str, Any]:
-    """Every setting of a run, SI; for a scan, at its first point.
+    """Every setting of a run, SI. For a scan, at its first point.
 
     Raises:
         RecordingError: run.json lacks them.
     """
     resolved: Any = run.record.get("resolved")
     if not (isinstance(resolved, dict) and isinstance(resolved.get("profile"), dict)):
-        raise RecordingError(run.path / RUN_FILE, "does not say what the run was taken with")
+        raise RecordingError(run.path / RUN_FILE, "does not contain the settings of the run")
     return cast("dict[str, Any]", resolved)
 
 
@@ -42,27 +42,27 @@ def stored_text(path: Path, sha256: str) -> StoredText:
     """The text of a file in a run's folder.
 
     Args:
-        sha256: Its SHA-256 when the run was begun.
+        sha256: SHA-256 of the file when the run began.
 
     Raises:
-        RecordingError: It is missing or has been changed.
+        RecordingError: The file is missing or has been changed.
     """
-    # as encode_text wrote it: a comment in the file may hold bytes that are not UTF-8
+    # as encode_text wrote it, because comments in the file may contain bytes that are not UTF-8
     text = read_file(path).decode("utf-8", "surrogateescape")
     if sha256_of_text(text) != sha256:
-        raise RecordingError(path, f"is not what {RUN_FILE} says it was", "restore it from a backup")
+        raise RecordingError(path, f"is not the file described in {RUN_FILE}", "restore it from a backup")
     return StoredText(text, str(path))
 
 
 class RecordedFiles(NamedTuple):
-    """The files and calibrations that a run began with, to assemble it once more.
+    """The files and calibrations with which a run began, to assemble it again.
 
     Attributes:
-        sequence_path: Where the sequence was; paths in it are relative to this.
+        sequence_path: Original path of the sequence. Paths in it are relative to this.
         sequence: Its text.
-        profile_path: Where the profile was.
+        profile_path: Original path of the profile.
         profile: Its text.
-        calibrations: Kind -> id of the calibrations, no others are active; None for those in use today.
+        calibrations: Kind -> id of the only active calibrations. None for the calibrations in use today.
     """
 
     sequence_path: Path
@@ -73,7 +73,7 @@ class RecordedFiles(NamedTuple):
 
 
 def files_of(run: Run) -> RecordedFiles:
-    """The files and calibrations that a run began with, from the copies in its folder.
+    """The files and calibrations with which a run began, from the copies in its folder.
 
     Raises:
         RecordingError: A copy is missing or has been changed.
@@ -86,7 +86,7 @@ def files_of(run: Run) -> RecordedFiles:
 
 
 def plugins_of(run: Run) -> PluginHost:
-    """The plugins that a run can use: those installed now, and those of its own folders.
+    """The installed plugins, and the plugins from a run's own folders.
 
     Raises:
         ConfigError: A folder no longer exists.
@@ -101,7 +101,7 @@ def calibrations_of(run: Run) -> dict[str, CalibrationEntry]:
 
     Raises:
         ConfigError: A copy is missing or damaged.
-        RecordingError: A copy is not the calibration that the run was taken with.
+        RecordingError: A copy is not the calibration with which the run was taken.
     """
     entries: dict[str, CalibrationEntry] = {}
     for kind, own in cast("Mapping[str, str]", run.record.get("calibrations") or {}).items():
@@ -109,7 +109,7 @@ def calibrations_of(run: Run) -> dict[str, CalibrationEntry]:
         entries[kind] = read_entry(path)
         if entries[kind].id != own:
             text = f"is calibration {entries[kind].id}, but the run was taken with {own}"
-            raise RecordingError(path, text, "restore that from a backup")
+            raise RecordingError(path, text, "restore that calibration from a backup")
     return entries
 
 
@@ -137,10 +137,10 @@ def recorded_machine(machine: Mapping[str, Any], called: str) -> Machine:
 
 
 def profile_of_shot(resolved: Mapping[str, Any], parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """The profile that a shot was taken with: that of its run with the shot's own point of a scan.
+    """The profile of a shot, which is the run's profile at the shot's own point of a scan.
 
     Args:
-        resolved: Every setting of the run, SI; for a scan, at its first point.
+        resolved: Every setting of the run, SI. For a scan, at its first point.
         parameters: Settings of the shot: address -> value, SI.
 
     Example:
@@ -168,17 +168,17 @@ def machine_of_shot(shot: Shot) -> Machine:
     """
     resolved: Any = shot.provenance["resolved"]
     if not (isinstance(resolved, dict) and isinstance(cast("Any", resolved).get("profile"), dict)):
-        raise RecordingError(shot.file, "does not say what the shot was taken with")
+        raise RecordingError(shot.file, "does not contain the settings of the shot")
     profile = profile_of_shot(cast("dict[str, Any]", resolved), shot.parameters)
     return recorded_machine(profile, "the profile in the shot's file")
 
 
 def machine_of(run: Run) -> Machine:
-    """The grid of a run, with the tones of its calibrations, and its motion; for a scan, at its first point.
+    """Grid and motion of a run, with calibrated tones. For a scan, at its first point.
 
     Raises:
         ConfigError: The recorded settings are invalid.
-        RecordingError: run.json lacks them.
+        RecordingError: run.json lacks the settings.
     """
     return recorded_machine(resolved_of(run)["profile"], str(run.path / RUN_FILE))
 

@@ -1,4 +1,4 @@
-"""Named regions of a sequence: sets of sites for the quantities that it measures."""
+"""Named regions of a sequence, which are sets of sites for its quantities."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from labseq.settings import PatternChoice
 def with_regions(
     target: TargetPattern, hardware: ResolvedProfile, document: Document, regions: dict[str, Any]
 ) -> TargetPattern:
-    """A target that knows the regions of its sequence.
+    """A copy of a target with the regions of its sequence.
 
     Args:
         target: The target.
@@ -29,7 +29,7 @@ def with_regions(
         regions: Name -> rows and columns as text, a list of sites, or a pattern.
 
     Raises:
-        ConfigError: A region has no sites, or some beyond the grid; names the first.
+        ConfigError: A region has no sites, or has sites beyond the grid. The message names the first.
     """
     for name, written in regions.items():
         loc: Loc = ("regions", name)
@@ -50,7 +50,7 @@ def _pattern(hardware: ResolvedProfile, document: Document, loc: Loc) -> Occupan
     chosen = resolve(hardware.host, document, "pattern", choice)
     try:
         return construct_target(chosen, hardware.grid).fill
-    except PluginLoadError:  # names the plugin at fault; no value of the file is wrong
+    except PluginLoadError:  # names the plugin at fault, as the file is right
         raise
     except LabseqError as error:
         raise document.error(loc, str(error)) from error

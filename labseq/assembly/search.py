@@ -1,4 +1,4 @@
-"""An adaptive scan: the scanner that chooses its points, and the ranges that it may choose from."""
+"""The scanner that chooses the points of an adaptive scan, and the allowed ranges."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from labseq.roles import Scanner, Step
 
 TO_OPTIMISE: Final = "to optimise"
-"""What the scan needs its quantity for, in messages."""
+"""Purpose of the scan's quantity, in messages."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +33,7 @@ class Search:
 
     Attributes:
         scan: The scan.
-        corners: Validates its settings; its points are the corners of the ranges.
+        corners: Validates its settings at the corners of the ranges.
         chosen: The scanner.
         ranges: The range of each address.
     """
@@ -57,8 +57,8 @@ class Search:
         """Construct the scanner.
 
         Raises:
-            ConfigError: It refuses its settings; with their place.
-            PluginLoadError: Its constructor raised.
+            ConfigError: The scanner refuses its settings. The error has their place.
+            PluginLoadError: The constructor raised.
         """
         return construct_one(self.chosen, ScanSpace(self.ranges, self.scan.n_points, self.scan.repeats, seed))
 
@@ -84,7 +84,7 @@ class Search:
         return {range_.address: written(values[range_.address], unit) for range_, unit in pairs}
 
     def record(self) -> dict[str, Any]:
-        """The scan for the run's record, JSON-ready; the points are in the index."""
+        """The scan for the run's record, JSON-ready. The points are in the index."""
         return {
             "addresses": [range_.address for range_ in self.ranges],
             WRITTEN_UNITS: self.units,
@@ -99,11 +99,11 @@ class Search:
     def choose(
         self, scanner: Scanner, visited: Sequence[VisitedPoint], stop: StopFlag
     ) -> dict[str, float] | None:
-        """The scanner's next point, checked: address -> value, SI; None if it has finished.
+        """The scanner's next point as address -> value, SI, after checks. None if it has finished.
 
         Raises:
-            DeviceError: The scanner raised, or returned no point of its ranges; names the scanner.
-            DeviceTimeoutError: It did not answer in time.
+            DeviceError: The scanner raised, or returned a point outside of its ranges.
+            DeviceTimeoutError: The scanner did not answer in time.
             StopRequested: The operator asked to stop.
         """
         guard, timeout_s = Guard(stop), self.corners.hardware.profile.timeouts.call_s
@@ -135,7 +135,7 @@ class Search:
         """A value of a range, without rounding errors.
 
         Raises:
-            DeviceError: It is not in the range.
+            DeviceError: The value is not in the range.
         """
         near = range_.allowed(value)
         if near is not None:
@@ -161,14 +161,14 @@ def make_search(
     target: TargetPattern | None,
     problems: ProblemCollector,
 ) -> Search | None:
-    """Choose and check the scanner of a scan; None if its points are listed, or if there is a problem.
+    """Choose and check the scanner of a scan. None if its points are listed, or if there is a problem.
 
     The scanner is constructed once, to check that its constructor accepts the settings.
 
     Args:
-        corners: The points of the scan, checked: of an adaptive scan, the corners of its ranges.
+        corners: The checked points of the scan, or for an adaptive scan the corners of its ranges.
         results: Names of the results of the analyses, see :func:`labseq.assembly.quantities.check_quantity`.
-        target: The target of the sequence; None if it has errors.
+        target: The target of the sequence. None if it has errors.
     """
     scan = corners.scan
     if not isinstance(scan, AdaptiveScan) or problems.problems:
@@ -179,7 +179,7 @@ def make_search(
     chosen: ChosenPlugin | None = None
     with problems:
         chosen = resolve(corners.hardware.host, document, "scanner", choice)
-    # the first corner has the lower end of every range, the last one the upper end
+    # the first corner has the lower end of every range, the last corner the upper end
     low = corners.at(0).parameters
     high = corners.at(math.prod(scan.shape) - 1).parameters
     ranges: list[ScanRange] = []
@@ -196,15 +196,15 @@ def make_search(
 
 
 def _range(axis: RangeAxis, resolved: tuple[Any, Any], present: Any) -> ScanRange:
-    """The range of an axis, if its ends are numbers that the settings model accepts unchanged."""
+    """The range of an axis. Its ends must be numbers that the settings model accepts unchanged."""
     low, high = axis.low.si, axis.high.si
     if not all(map(_is_number, resolved)) or not all(map(math.isclose, resolved, (low, high))):
-        what = f"'{clean(axis.address)}' is not a number, or not the one that is written"
+        what = f"the setting '{clean(axis.address)}' is not a number, or changes the given number"
         raise axis.key.error(what, "an address of a number or quantity")
     is_whole = all(type(value) is int for value in resolved)
     if is_whole and axis.n_steps and (high - low) % axis.n_steps:
         what = f"{axis.n_steps} equal steps from {low:g} to {high:g} are not whole numbers"
-        raise axis.key.error(what, f"a number of steps that {high - low:g} is a multiple of")
+        raise axis.key.error(what, f"a number of steps that divides {high - low:g}")
     low, high = resolved if is_whole else (float(resolved[0]), float(resolved[1]))
     start = float(present) if _is_number(present) and low <= present <= high else math.nan
     return ScanRange(axis.address, low, high, is_whole, axis.n_steps, start)

@@ -1,4 +1,4 @@
-"""Whether the lines are wired so that devices work, and exposures suit the trigger of the camera."""
+"""Checks that lines are wired so that devices work, and that exposures suit the camera's trigger."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROUNDING: Final = 1e-9
 
 
 def wrong_wiring(document: Document, lab: Lab) -> Iterator[Problem]:
-    """Lines that the timing box does not have, that would harm the camera, or that cannot trigger a device.
+    """Problems of lines that the box lacks, that would damage the camera, or that cannot trigger a device.
 
     Args:
         document: The profile's file.
@@ -39,11 +39,11 @@ def wrong_wiring(document: Document, lab: Lab) -> Iterator[Problem]:
     if wired is not None and not lab.mobile_tweezers.waits_for_trigger:
         loc = ("lines", "channels", wired.name, "triggers")
         what = "the mobile tweezers take no external trigger"
-        yield document.problem(loc, what, "mobile tweezers that do, such as `spcm`")
+        yield document.problem(loc, what, "mobile tweezers with a trigger input, such as `spcm`")
 
 
 def _trigger_of_camera(document: Document, camera: CameraFacts, line: LineSpec | None) -> Iterator[Problem]:
-    """Why a line cannot trigger the camera as its ``line_trigger`` says; ``line`` is None if none does."""
+    """Why a line cannot trigger the camera according to ``line_trigger``. ``line`` may be None."""
     kind = camera.line_trigger
     if line is None:
         if kind != "external":
@@ -53,12 +53,12 @@ def _trigger_of_camera(document: Document, camera: CameraFacts, line: LineSpec |
     loc = ("lines", "channels", line.name)
     if kind not in camera.triggers:
         what = f"the camera takes no {kind} trigger"
-        expected = f"a camera that does; this one takes {one_of(camera.triggers)}"
+        expected = f"a camera with this trigger (this camera takes {one_of(camera.triggers)})"
         yield document.problem((*loc, "triggers"), what, expected)
     changes = {"lead": line.lead_s, "lag": line.lag_s, "pulse": line.pulse_s}
     for key in (key for key, time_s in changes.items() if time_s and kind == "bulb"):
         what = f"the camera exposes as long as '{line.name}' is on (`line_trigger: bulb`)"
-        expected = f"no `{key}`, so that it is on during the exposure alone"
+        expected = f"no `{key}`, so that the line is on only during the exposure"
         yield document.problem((*loc, key), what, expected)
 
 
@@ -71,7 +71,7 @@ def unsuitable_exposures(
         bars: The timeline of the shot, each with the place of its step in the sequence.
 
     Returns:
-        What is wrong, with its place in the sequence, or in the profile for ("camera", ...).
+        The problems, each with its place in the sequence, or in the profile for ("camera", ...).
     """
     if camera.line_trigger == "bulb":
         yield from _between_edges(lines.resolution_s, bars)
@@ -87,17 +87,17 @@ def _between_edges(
         # largest relative error of an exposure that the edges of a line make
         if abs(made_s - bar.exposure_s) > 1e-3 * bar.exposure_s:
             came, step = (format_quantity(s, "time") for s in (bar.exposure_s, resolution_s))
-            what = f"the exposure is {came}, and the edges of the line make it (`line_trigger: bulb`)"
+            what = f"the exposure is {came}, which the line cannot make (`line_trigger: bulb`)"
             yield (*loc, "exposure"), Problem(what, expected=f"a multiple of {step}")
 
 
 def _out_of_step(cycle_s: float, bars: Sequence[tuple[Loc, TimelineEntry]]) -> Iterator[tuple[Loc, Problem]]:
-    """Images that do not follow one another at a fixed interval, or faster than the camera."""
+    """Problems of images without a fixed interval, or faster than the camera."""
     cycle, longest_s = format_quantity(cycle_s, "time"), 0.0
     for i, j in pairwise(n for n, (_, bar) in enumerate(bars) if bar.n_images):
         loc, image = bars[j]
         if image.exposure_s != bars[i][1].exposure_s:
-            continue  # the camera is armed again, and waits for an edge
+            continue  # the camera is armed again and waits for an edge
         longest_s = max(longest_s, sum(bar.duration_s for _, bar in bars[i:j]))
         varies = next((bar for _, bar in bars[i + 1 : j + 1] if bar.min_duration_s != bar.duration_s), None)
         if varies is not None:

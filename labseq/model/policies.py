@@ -146,9 +146,7 @@ class RunPolicy:
         """
         if isinstance(error, _ENDING):
             return "stop"
-        if isinstance(
-            error, ShotAbortedError
-        ):  # the leader decides how often, and the machine has not failed
+        if isinstance(error, ShotAbortedError):  # the leader decides how often
             return "repeat_shot"
         then = error.then if isinstance(error, OverBudgetError) else self.of_step(step).on_failure
         if then is None:

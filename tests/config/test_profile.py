@@ -252,7 +252,7 @@ TRIGGER = {"channel": 0, "on": ["image"], "triggers": "camera"}
         ({"a": PULSE, "b": PULSE}, "'a' and 'b' are both on channel 0"),
         ({"a": TRIGGER, "b": TRIGGER | {"channel": 1}}, "'a' and 'b' both trigger the camera"),
         ({"a": TRIGGER | {"lead": "1 ms"}}, "lead is set for a trigger"),
-        ({"a": PULSE | {"lag": "1 ms"}}, "lag is set beside pulse"),
+        ({"a": PULSE | {"lag": "1 ms"}}, "both lag and pulse are set"),
         ({"a": PULSE | {"on": ["load", "idle"]}}, "a pulse has 'idle' among its steps"),
         (
             {"a": PULSE | {"channel": "ao0"}},

@@ -60,7 +60,7 @@ def test_what_makes_no_sense_is_refused(kind: CalibrationKind, values: Any, mess
         ({"values": {}}, "'offset_m' is missing"),
         ({"grid": {}}, "the grid has no 'rows'"),
         ({"grid": {**grid_facts(GRID), "rows": 0}}, "no sites"),
-        ({"taken_utc": "2026-11-20T08:00:00"}, "without a time zone"),
+        ({"taken_utc": "2026-11-20T08:00:00"}, "which has no time zone"),
         ({"taken_utc": "yesterday"}, "Invalid isoformat"),
     ],
 )

@@ -90,8 +90,8 @@ def test_paths_come_back_from_the_flat_arrays():
         (([[0.0], [1.0]], np.empty((2, 0))), "one tone of each axis"),
         (([[0.0], [1.0]], [[0.0]]), "column has shape"),
         (([[0.0], [np.nan]], [[0.0], [0.0]]), "not finite"),
-        (([[0.0], [1.0]], [[0.0], [0.0]], [0]), "row_off holds knots from 1"),
-        (([[0.0, 1.0]] * 3, [[0.0]] * 3, [1, 1]), "row_off holds knots from 1"),
+        (([[0.0], [1.0]], [[0.0], [0.0]], [0]), "row_off must have knots from 1"),
+        (([[0.0, 1.0]] * 3, [[0.0]] * 3, [1, 1]), "row_off must have knots from 1"),
         (([[0.0, 1.0]] * 3, [[0.0]] * 3, [1, 2], [3]), "column_off"),
     ],
 )
@@ -102,7 +102,7 @@ def test_what_is_no_path_is_refused(paths, message):
 
 def test_only_line_batches_are_linked():
     sites = np.array([[0, 0]])
-    with pytest.raises(ValueError, match="only line batches are linked"):
+    with pytest.raises(ValueError, match="only line batches can be linked"):
         Batch(sites, sites + 1, linked=True, tones=TonePaths(np.zeros((2, 1)), np.array([[0.0], [1.0]])))
 
 

@@ -144,7 +144,7 @@ def test_values_are_for_sequences_that_allow_them(tmp_path: Path) -> None:
         (["leader={may_set: []}"], "may_set"),
         (
             [MAY_SET, "shots=2", "scan={planner.degree_of_parallelism: [3, 5]}"],
-            "the sequence has a scan, and a leader",
+            "a scan and a leader cannot both set values",
         ),
     ],
 )

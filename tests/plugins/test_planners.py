@@ -137,7 +137,7 @@ def test_nothing_to_do(name: str) -> None:
 
 @pytest.mark.parametrize("name", PLANNERS)
 def test_an_occupancy_of_another_shape_is_refused(name: str) -> None:
-    with pytest.raises(PlanError, match=r"shape \(20, 19\); the grid has \(20, 20\)") as refusal:
+    with pytest.raises(PlanError, match=r"shape \(20, 19\), but the grid has \(20, 20\)") as refusal:
         PLANNERS[name](Context(), 7).plan(np.ones((20, 19)), COMPACT)
     assert refusal.value.planner == name
 

@@ -218,7 +218,7 @@ def test_a_card_that_would_play_a_pause_between_batches_is_refused_one() -> None
     key = "profile.mobile_tweezers.overhead_per_batch"
     what = f"--set {key}=1 us: a dead time before each batch is set for 'spcm', which would play silence"
     (message,) = messages(profile="bench_awg", overrides=[f"{key}=1 us"])
-    assert message.startswith(f"{what}; expected none: batches follow each other")
+    assert message.startswith(f"{what}; expected none, as only `use: virtual`")
 
 
 def test_wrong_options_are_reported_with_the_files() -> None:

@@ -152,7 +152,7 @@ def test_another_one_than_that_in_use_may_be_chosen(bench: Bench) -> None:
     with pytest.raises(ConfigError, match="there is no calibration of overlay 'abc'") as caught:
         bench.session()
     (note,) = caught.value.problems[0].notes
-    assert note.startswith("asked for by the key 'calibrations.use.overlay' of ")
+    assert note.startswith("it is chosen by the key 'calibrations.use.overlay' of ")
 
 
 def test_a_dry_run_of_a_real_lab_has_a_store_of_its_own(bench: Bench) -> None:
@@ -179,7 +179,7 @@ def test_a_damaged_one_that_is_in_use_is_refused(bench: Bench, kind: Calibration
     (problem,) = caught.value.problems
     assert problem.source == str(path)
     assert f"'labseq calibration use {kind}=off --profile " in problem.notes[0]
-    assert "bench.yaml' puts it aside" in problem.notes[0]
+    assert "bench.yaml' turns it off" in problem.notes[0]
 
 
 def test_a_tone_program_is_made_with_them(bench: Bench) -> None:

@@ -117,7 +117,7 @@ def test_a_mistake_is_named_with_its_place(tmp_path: Path, line: str, expected: 
 
 def test_survival_needs_two_images(tmp_path: Path) -> None:
     text = HEAD + "measure: survival\nshot: [{load: {}}, {name: first, image: {}}]\n"
-    assert "5:10: there is no 'survival' to measure: the shot has one image, 'first'" in message(
+    assert "5:10: there is no 'survival' to measure because the shot has one image, 'first'" in message(
         tmp_path, text
     )
 
@@ -165,7 +165,7 @@ def test_a_fit_has_the_parameters_of_its_model(tmp_path: Path, measure: str, exp
 
 def test_a_fit_needs_a_scan(tmp_path: Path) -> None:
     text = HEAD + "measure: [{value: loading, fit: exponential}]\n" + SURVIVAL
-    assert "there is no scan along which to fit; expected 'scan'" in message(tmp_path, text)
+    assert "a fit needs a scan; expected 'scan'" in message(tmp_path, text)
 
 
 SCANNED = HEAD.replace("shots: 2\n", "repeats: 40\norder: shuffled\n") + SCAN.replace("2 s]", "9 s, 60 s]")
@@ -200,14 +200,14 @@ def test_an_error_has_the_unit_of_what_is_fitted_along(tmp_path: Path) -> None:
 def test_a_run_that_takes_point_after_point_cannot_end_early(tmp_path: Path) -> None:
     text = SCANNED.replace("order: shuffled\n", "")
     text += "measure: [{value: survival, fit: exponential, stop_when: {decay: 2 %}}]\n" + SURVIVAL
-    assert "the run cannot end early: it takes all shots of a point" in message(tmp_path, text)
+    assert "the run cannot end early because it takes all shots of a point" in message(tmp_path, text)
 
 
 def test_a_scan_of_names_cannot_be_fitted(tmp_path: Path) -> None:
     scan = "scan: {shot.1.image.correct_overlay: [false, true]}\n"
     text = SCANNED.replace(SCANNED[SCANNED.index("scan:") :], scan)
     text += "measure: [{value: survival, fit: exponential}]\n" + SURVIVAL
-    assert "there is nothing to fit along" in message(tmp_path, text)
+    assert "a fit needs numbers" in message(tmp_path, text)
 
 
 FITS = """
@@ -339,7 +339,7 @@ def test_named_regions_are_sites_of_quantities(tmp_path: Path) -> None:
         ("{left: {pattern: bitmap, sites: '...'}}", "5:"),
         ("{left: {pattern: compact, rows: 30, cols: 2}}", "5:17: "),
         ("{target: '1,1'}", "5:11: 'target' cannot be the name of a region"),
-        ("{left: 'a b'}", "5:17: 'a b' names no sites"),
+        ("{left: 'a b'}", "5:17: 'a b' is not a set of sites"),
     ],
 )
 def test_a_wrong_region_is_one_error(tmp_path: Path, regions: str, expected: str) -> None:

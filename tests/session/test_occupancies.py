@@ -49,7 +49,7 @@ def test_a_fresh_seed_is_named_and_repeats_the_draw() -> None:
         ("random:20x20@1.5", "the filling fraction is '1.5'; expected a number from 0 to 1"),
         ("random:20x20@nan", "the filling fraction is 'nan'"),
         ("random:20x1001@0.75", "20 x 1001 sites; expected 1 to 1000"),
-        ("", "the occupancy is an empty text; expected a text file"),
+        ("", "the occupancy is empty; expected a text file"),
         ("nowhere.npy", "nowhere.npy: there is no such file; expected a text file of 0 and 1, a .npy file"),
         ("x" * 5000, "there is no such file"),
     ],
@@ -74,8 +74,8 @@ def test_npy_of_any_number_type(tmp_path: Path, dtype: Any, order: Any) -> None:
     [
         (np.zeros((2, 3, 4)), "a.npy: it holds 2 occupancies; expected"),
         (np.array([["1", "0"]]), "type <U1"),
-        (np.array([[1, 2]]), "only 0 and 1"),
-        (np.array([[np.nan, 1.0]]), "only 0 and 1"),
+        (np.array([[1, 2]]), "only contain 0 and 1"),
+        (np.array([[np.nan, 1.0]]), "only contain 0 and 1"),
         (np.zeros((0, 5), np.bool_), "0 x 5 sites; expected 1 to 1000"),
         (np.array([[None, {}]], dtype=object), "it cannot be read"),
     ],
@@ -109,7 +109,7 @@ def test_one_of_several_occupancies_in_the_files_of_other_programs(tmp_path: Pat
         ("two.npz:load#1", "it holds no array 'load'; expected one of loaded, after; did you mean 'loaded'?"),
         ("two.npz:loaded", "it holds 2 occupancies; expected"),
         ("two.npz:loaded#2", "there is no occupancy '2'; expected 0 to 1"),
-        ("one.npz#0", "an array of shape (2, 3); expected (rows, columns), or with '#'"),
+        ("one.npz#0", "the array has shape (2, 3); expected (rows, columns), or (occupancies, rows, columns)"),
         ("a.h5", "is not a shot's file of labseq; expected a shot's file; name the array"),
         ("a.h5:time", "holds no array 'time'; expected scan 1/loaded (2, 2, 3)"),
         ("b.npz", "there is no such file"),
@@ -189,7 +189,7 @@ def test_texts_are_read_as_they_were_written(occupancy: Occupancy, signs: str, b
         ),
         (b"[[1, 0], 1]\n", "mine:1:10: '1' is not within a row"),
         (b"[[1, 0],\n [1]]\n", "mine:2:4: this row has 1 sites"),
-        (b"1" * (MAX_BYTES + 1), "it is larger than 32 MiB"),
+        (b"1" * (MAX_BYTES + 1), "this text is larger than 32 MiB"),
     ],
 )
 def test_other_texts_are_refused_with_their_place(text: bytes, words: str) -> None:

@@ -97,7 +97,7 @@ def test_a_target_is_centred_or_at_its_origin() -> None:
         (
             COMPACT,
             {"overrides": ["profile.grid.rows=3"]},
-            "there is no --profile to change",
+            "--profile is missing",
         ),
         (COMPACT, {"profile": "virtul"}, "did you mean 'virtual'?"),
     ],
@@ -148,7 +148,7 @@ def test_a_shot_brings_its_target_and_its_machine() -> None:
     assert found.machine.motion.speed_m_s == pytest.approx(0.2)
     other = read_inputs(PlanRequest("a shot", "{pattern: compact, rows: 4, cols: 4}"), source)
     assert other.target.n_atoms == 16
-    with pytest.raises(ConfigError, match="there is no --target to move"):
+    with pytest.raises(ConfigError, match="--origin needs --target"):
         read_inputs(PlanRequest("a shot", origin="1,1"), source)
 
 

@@ -309,7 +309,7 @@ def test_a_dry_run_reports_why_a_plugin_failed_to_load() -> None:
     assert (
         "camera: plugin 'cannon' failed to load: ModuleNotFoundError: No module named 'no_such_sdk'" in text
     )
-    assert "its virtual twin takes its place and its settings were not checked" in text
+    assert "its virtual twin is used instead, and its settings were not checked" in text
     text = warnings_of_a_dry_run("ixon")
     assert "plugin 'ixon' is not installed (plugin 'cannon' did not load (ModuleNotFoundError" in text
 

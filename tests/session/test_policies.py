@@ -202,7 +202,7 @@ def test_a_timeout_shorter_than_the_step_is_a_warning(tmp_path: Path) -> None:
         (
             "{}",
             {"policy": {"checks": [{"value": "x", "at_least": 2, "then": "skip_point"}]}},
-            "there is no scan whose points could be skipped; expected 'warn' or 'stop'",
+            "without a scan there are no points to skip; expected 'warn' or 'stop'",
         ),
     ],
 )
@@ -220,7 +220,7 @@ def test_only_what_leaves_the_atoms_alone_is_tried_again(tmp_path: Path) -> None
         "- load: {duration: 500 ms}", "- load: {duration: 500 ms}\n    policy: {retries: 1}"
     )
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"10:14: 'load' cannot be tried again in the same shot") as caught:
+    with pytest.raises(ConfigError, match=r"10:14: 'load' cannot be repeated in the same shot") as caught:
         labseq.Session.open(path)
     assert "on_failure: repeat_shot" in str(caught.value)
 

@@ -251,7 +251,7 @@ def test_a_text_that_was_edited_is_refused(taken, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(taken.path, folder)
     (folder / "sequence.yaml").write_text(SEQUENCE + "# later\n")
-    with pytest.raises(RecordingError, match=r"sequence.yaml: is not what run.json says"):
+    with pytest.raises(RecordingError, match=r"sequence.yaml: is not the file described in run.json"):
         replay(open_run(folder), ReplayRequest())
 
 

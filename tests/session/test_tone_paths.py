@@ -139,7 +139,7 @@ def test_what_labseq_plan_writes_is_read_again(folder: Path) -> None:
     assert parse_plan(json.dumps(values).encode(), "plan.json").plan.is_same(moves.plan)
     tones = values["batches"][0]["tones"]
     for words, key, wrong in (
-        ("row_off holds knots from 1", "row_off", [9 for _ in tones["row_off"]]),
+        ("row_off must have knots from 1", "row_off", [9 for _ in tones["row_off"]]),
         ("column has shape", "column", tones["column"][1:]),
     ):
         values["batches"][0]["tones"] = tones | {key: wrong}

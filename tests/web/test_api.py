@@ -102,7 +102,7 @@ def test_a_run_without_settings_has_no_motion(client: Any, run_dir: Path) -> Non
     """The motion of a run in the virtual lab is compared in a browser, see ``test_browser.py``."""
     answer = client.get(f"{path_of(run_dir)}/shots/0/motion/0")
     assert answer.status_code == 409
-    assert "does not say what the shot was taken with" in answer.json()["error"]
+    assert "does not contain the settings of the shot" in answer.json()["error"]
 
 
 def test_a_frame_is_shown_from_black_to_white_at_every_size(tmp_path: Path) -> None:
