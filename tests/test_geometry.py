@@ -84,7 +84,7 @@ def test_what_is_drawn_is_read(rows: list[list[bool]]) -> None:
     ("text", "what"),
     [
         ("", "is empty"),
-        ("##\n#\n##", "row 2 of the drawing has 1 characters and row 1 has 2"),
+        ("##\n#\n##", "row 2 of the drawing has 1 characters, but row 1 has 2"),
         ("..\n..", "holds no atom"),
     ],
 )

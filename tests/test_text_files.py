@@ -79,11 +79,11 @@ def test_path_is_kept_as_given() -> None:
         (b"\xef\xbb\xbf", "f.yaml: the file is empty; expected a mapping that begins with 'labseq: 1'"),
         (
             b"\n- 1",
-            "f.yaml:2:1: the top level of the file is a list; expected a mapping that begins with 'labseq: 1'",
+            "f.yaml:2:1: the top level is a list; expected a mapping that begins with 'labseq: 1'",
         ),
         (
             b"hello",
-            "f.yaml:1:1: the top level of the file is 'hello'; expected a mapping that begins with 'labseq: 1'",
+            "f.yaml:1:1: the top level is 'hello'; expected a mapping that begins with 'labseq: 1'",
         ),
         (
             b"a: b\nspacing: 4.49 \xb5m\n",

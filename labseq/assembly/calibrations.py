@@ -214,9 +214,7 @@ def _with_tones(document: Document, grid: SiteGrid, entries: Mapping[str, Calibr
     if (frequencies := entries.get("frequencies")) is not None:
         row_hz, column_hz = frequencies.values["row_hz"], frequencies.values["column_hz"]
         grid = replace(grid, row_frequency_hz=row_hz, column_frequency_hz=column_hz)
-    if (
-        overlay := entries.get("overlay")
-    ) is not None:  # second, because it was measured with these frequencies
+    if (overlay := entries.get("overlay")) is not None:  # second, as it was measured with these frequencies
         try:
             grid = correct_overlay(grid, overlay.values["offset_m"])
         except LimitError as error:

@@ -113,8 +113,7 @@ def _check_stop(
     """Check the errors at which the run ends.
 
     Raises:
-        ConfigError: An error cannot be read, belongs to a fixed parameter, or the scan's order prevents an
-            early end.
+        ConfigError: An error is unreadable, its parameter is fixed, or the scan's order is not shuffled.
     """
     fixed = {name for name in model.fixed if name not in measure.parameters}
     fixed |= {name for name, value in measure.parameters.items() if value != "free"}

@@ -133,9 +133,7 @@ def parse_text(data: bytes, name: str) -> Occupancy:
         [[1, 0, 1]]
     """
     if len(data) > MAX_BYTES:
-        raise ConfigError(
-            Problem(f"this text is larger than {MAX_BYTES >> 20} MiB", name, expected=_size_limit())
-        )
+        raise ConfigError(Problem(f"this is larger than {MAX_BYTES >> 20} MiB", name, expected=_size_limit()))
     text = _Text(decode(data, name), name)
     rows = [(start, text.sites(start, row)) for start, row in text.rows()]
     if not rows:

@@ -1,4 +1,4 @@
-"""The steps, patterns, detectors and analyses that labseq itself offers, registered like any plugin's."""
+"""The steps, patterns, detectors and analyses of labseq itself, registered like those in plugins."""
 
 from __future__ import annotations
 

@@ -14,20 +14,19 @@ from labseq.plugin.planning import follow_atoms
 
 
 class SurvivalSettings(Settings):
-    """How many atoms are there on the next image, site by site."""
+    """``survival``: the survival of atoms from image to image, site by site."""
 
     atoms: Literal["all", "moved", "held"] = Field(
         default="all",
-        description="which atoms count: all, those that were moved in between, or those that were not",
+        description="which atoms count: all, atoms that were moved in between, or atoms that were not",
     )
 
 
 class SurvivalAnalysis:
     """Site-resolved survival from each image of a shot to the next.
 
-    An atom counts at the site where it should be on the next image: that to which the batches
-    that were played between the two have moved it. Atoms that they ejected do not count. What
-    detection gets wrong is part of it.
+    An atom counts at the site to which the batches between the two images have moved it. Ejected atoms do not
+    count. The survival includes detection errors.
     """
 
     results = ("survival",)
@@ -68,5 +67,5 @@ class SurvivalAnalysis:
 
 
 def _place(record: ImageRecord | CycleRecord) -> tuple[int, int]:
-    """Its place in the shot: the image that ends a cycle has the place of the cycle."""
+    """Place of a record in the shot. The image that ends a cycle has the place of the cycle."""
     return record.step, record.cycle

@@ -1,9 +1,9 @@
 """The step that equalises the static tweezers in a closed loop.
 
-The power of the spot (i, j) depends on the tone of row i and the tone of column j:
-``P_ij = P f_i g_j (1 + e_ij)``. The factors f and g are the *separable* part, which the tones can
-make even; e is the rest, which they cannot change. Light shifts may be used instead of powers.
-Tweezers with a weight for each site, as an SLM makes, have no such rest.
+The power of the spot (i, j) depends on the tone of row i and the tone of column j: ``P_ij = P f_i g_j (1 +
+e_ij)``. The factors f and g are the *separable* part, which the tones can make even. The residual e cannot be
+changed by tones. Light shifts may be used instead of powers. Tweezers with a weight for each site, as from an
+SLM, have no such residual.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from labseq.roles import Shot, Step, StepContext
 Floats = NDArray[np.float64]
 
 DEAD: Final = 0.05
-"""Light of a row or column, relative to the median, below which its tone is taken to be off."""
+"""Light of a row or column, relative to the median, below which its tone counts as off."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,8 +37,8 @@ class Factors:
     Attributes:
         row: float64 (n_rows,).
         column: float64 (n_cols,).
-        residual: float64 (n_rows, n_cols), what is left of the logarithm of the power; nan where
-            nothing was measured.
+        residual: float64 (n_rows, n_cols), the residual of the logarithm of the power. nan where nothing was
+            measured.
     """
 
     row: Floats
@@ -52,18 +52,18 @@ class Factors:
 
     @property
     def residual_spread(self) -> float:
-        """The standard deviation of the rest, relative."""
+        """The standard deviation of the residual, relative."""
         measured = self.residual[np.isfinite(self.residual)]
         n_free = len(measured) - len(self.row) - len(self.column) + 1
         return float(np.sqrt((measured**2).sum() / max(1, n_free)))
 
 
 def factors(power: Floats) -> Factors:
-    """Separate powers into factors of rows and columns: a two-way analysis of variance of their logarithms.
+    """Separate powers into factors of rows and columns, by a two-way analysis of variance of logarithms.
 
     Args:
-        power: float64 (n_rows, n_cols), in any unit; nan where nothing was measured. Values
-            of 0 or less count as not measured.
+        power: float64 (n_rows, n_cols), in any unit. nan where nothing was measured. Values of 0 or less
+            count as not measured.
 
     Raises:
         DeviceError: A row or column has no light.
@@ -92,7 +92,7 @@ def factors(power: Floats) -> Factors:
 def _corrected(amplitudes: Floats, logarithm: Floats, gain: float, max_sum: float) -> Floats:
     before = np.asarray(amplitudes, np.float64)
     if not np.all(before > 0):
-        raise ValueError("an amplitude is not above 0: nothing can be measured of its tone")
+        raise ValueError("an amplitude is not above 0, so its tone cannot be measured")
     after = before * np.exp(-0.5 * gain * logarithm)
     after *= min(float(before.sum()), max_sum) / after.sum()
     return np.minimum(after, 1.0)
@@ -109,19 +109,19 @@ def _refuse_dead(power: Floats, measured: NDArray[np.bool_]) -> None:
         dead = np.flatnonzero(mean <= DEAD * np.median(mean))
         if len(dead):
             lines = ", ".join(str(line) for line in dead[:5]) + (", ..." if len(dead) > 5 else "")
-            message = f"no light on {name} {lines}: is its tone on, and are its spots where the camera looks?"
+            message = f"no light on {name} {lines}; check that its tone is on and the camera sees its spots"
             raise DeviceError("static_tweezers", message)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correction:
-    """What follows from a measurement of the powers.
+    """The correction from a measurement of the powers.
 
     Attributes:
         values: The values to play next.
-        spread: The rms of the part that they can change, relative.
-        residual_spread: The standard deviation of the rest, relative.
-        off: Logarithms of what each value is off by, like ``values``.
+        spread: The rms of the part that the values can change, relative.
+        residual_spread: The standard deviation of the residual, relative.
+        off: Logarithms of the deviation of each value, like ``values``.
     """
 
     values: tuple[Floats, ...]
@@ -131,7 +131,7 @@ class Correction:
 
 
 class Tones:
-    """How the powers follow the amplitudes of rows (n_rows,) and of columns (n_cols,)."""
+    """Powers that follow the amplitudes of rows (n_rows,) and of columns (n_cols,)."""
 
     names = ("row", "column")
 
@@ -142,7 +142,7 @@ class Tones:
     def correct(self, power: Floats, values: tuple[Floats, ...], limits: EqualiseSettings) -> Correction:
         """Amplitudes that make the spots more even, as powers go with the amplitude squared.
 
-        The sum of an axis' amplitudes stays what it was, or comes down to ``max_sum``.
+        The sum of an axis' amplitudes stays the same, or is reduced to ``max_sum``.
 
         Raises:
             DeviceError: A row or column has no light.
@@ -156,7 +156,7 @@ class Tones:
 
 
 class Sites:
-    """How the powers follow the weights of the sites, (n_rows, n_cols): in proportion."""
+    """Powers in proportion to the weights of the sites, (n_rows, n_cols)."""
 
     names = ("site",)
 
@@ -165,7 +165,7 @@ class Sites:
         return (power.ravel(),)
 
     def correct(self, power: Floats, values: tuple[Floats, ...], limits: EqualiseSettings) -> Correction:
-        """Weights that make the spots more even, with a mean of 1; those of unmeasured sites stay.
+        """Weights that make the spots more even, with a mean of 1. Weights of unmeasured sites stay.
 
         Raises:
             DeviceError: A row or column has no light.
@@ -187,13 +187,13 @@ class EqualiseSettings(PowerMeterSettings):
 
     tweezers: Literal["static", "mobile"] = Field(
         default="static",
-        description="which tweezers; all tones of the mobile ones are on for each frame of a camera",
+        description="which tweezers. For each frame of a camera all tones of mobile tweezers are on",
     )
     spread: Annotated[float, Field(gt=0, lt=1)] = Field(
         default=0.005, description="target rms of the part that rows and columns can even out"
     )
     gain: Annotated[float, Field(gt=0, le=1)] = Field(
-        default=0.8, description="fraction of it that a round takes out"
+        default=0.8, description="fraction of this part that a round corrects"
     )
     max_sum: Annotated[float, Field(gt=0)] = Field(
         default=1.0, description="largest sum of the amplitudes of an axis, as a fraction of full scale"
@@ -210,10 +210,10 @@ class LoopResult:
 
     Attributes:
         values: Amplitudes of rows and columns now in use, or the weights of the sites.
-        residual_spread: The standard deviation of the part that they cannot change, relative.
-        noise: The noise in the last of the spreads; both spreads include it.
-        spreads: Spread of each round, the last one included, of the part that they can change.
-        n_measured: Measurements in all.
+        residual_spread: The standard deviation of the part that the values cannot change, relative.
+        noise: The noise in the last spread and in the residual spread.
+        spreads: Spread in each round, including the last, of the part that the values can change.
+        n_measured: Total number of measurements.
     """
 
     values: tuple[Floats, ...]
@@ -232,27 +232,27 @@ def equalise_loop(
 ) -> LoopResult:
     """Measure and correct until the part of the powers that can be changed is even.
 
-    Each round averages measurements until their noise, estimated from their own scatter, is a third
-    of the target spread, or of the spread that the round is expected to leave.
+    Each round averages measurements until their noise, estimated from their scatter, is a third of the target
+    spread, or of the expected spread after the round.
 
     Args:
         measure: Measures the power of each spot once, float64 (n_rows, n_cols), nan where it cannot.
         apply: Plays such values.
-        values: Where to begin: amplitudes of rows (n_rows,) and of columns (n_cols,), or the weights of the
-            sites (n_rows, n_cols).
-        limits: Target spread, gain, and when to end.
-        control: How the powers follow them; None: as those of tones.
+        values: Initial amplitudes of rows (n_rows,) and of columns (n_cols,), or weights of the sites
+            (n_rows, n_cols).
+        limits: Target spread, gain, and limits of the loop.
+        control: How the powers follow the values. None for tones.
 
     Raises:
-        DeviceError: The loop does not converge, and why: a tone without light, too much
-            noise and how many averages it would take, or a spread that does not fall.
+        DeviceError: The loop does not converge. The message says why: a tone without light, too much noise
+            (with the number of averages that it would take), or a spread that does not fall.
     """
     limits, control = limits or EqualiseSettings(), control or Tones()
     spreads: list[float] = []
     n_measured = 0
     while len(spreads) < limits.max_rounds:
         apply(*values)
-        # 0.3 is the part of the spread that is expected to remain after a round
+        # 0.3 is the expected remaining fraction of the spread after a round
         noise_limit = 1 / 3 * max(limits.spread, 0.3 * spreads[-1] if spreads else 0.0)
         power, noise, n = _average(measure, control, noise_limit, limits.max_averages)
         n_measured += n
@@ -268,7 +268,7 @@ def equalise_loop(
 def _average(
     measure: Callable[[], Floats], control: Tones | Sites, noise_limit: float, max_averages: int
 ) -> tuple[Floats, float, int]:
-    """The mean of enough measurements, the noise of what can be changed, and how many there were."""
+    """The mean of enough measurements, the noise of its changeable part, and their number."""
     mean = np.asarray(measure(), np.float64)
     shares, noise = [_shares(mean, control)], math.inf
     while noise > noise_limit:
@@ -276,7 +276,7 @@ def _average(
         if n >= max_averages:
             needed = math.ceil(n * (noise / noise_limit) ** 2)
             _refuse(
-                f"too much noise: {n} averages leave {noise:.2%} of the separable part unknown; "
+                f"there is too much noise, as {n} averages leave {noise:.2%} of the separable part unknown; "
                 f"about {needed} averages are needed"
             )
         power = np.asarray(measure(), np.float64)
@@ -287,21 +287,21 @@ def _average(
 
 
 def _shares(power: Floats, control: Tones | Sites) -> tuple[Floats, ...]:
-    """The part of all light that each row and each column has, or that each site has."""
+    """The fraction of all light in each row and each column, or in each site."""
     light = np.where(np.isfinite(power), power, 0.0)
     return tuple(each / max(float(light.sum()), 1e-300) for each in control.light(light))
 
 
 def _noise(shares: list[tuple[Floats, ...]]) -> float:
-    """The rms of what can be changed of a mean of measurements that is due to noise, from their scatter.
+    """The rms noise in the changeable part of a mean of measurements, from their scatter.
 
     Args:
-        shares: Those of rows and of columns, or of sites, in each measurement.
+        shares: Fractions of rows and of columns, or of sites, in each measurement.
     """
     total = 0.0
     for each in zip(*shares, strict=True):
         mean, variance = np.mean(each, axis=0), np.var(each, axis=0, ddof=1)
-        lit = mean > DEAD * np.median(mean)  # those without light are refused later
+        lit = mean > DEAD * np.median(mean)  # values without light are refused later
         total += float(np.mean(np.where(lit, variance, 0.0) / np.where(lit, mean, 1.0) ** 2))
     return math.sqrt(total / len(shares))
 
@@ -316,13 +316,13 @@ def _refuse_standstill(
     )
     place = np.unravel_index(int(np.abs(off_by).argmax()), off_by.shape)
     worst = ", ".join(map(str, place))
-    share, cause = f"an amplitude of {played[place]:.3g} of full scale", "is an amplifier at its limit"
+    share, cause = f"an amplitude of {played[place]:.3g} of full scale", "no amplifier is at its limit"
     if off_by.ndim > 1:
-        worst, share, cause = f"({worst})", f"a weight of {played[place]:.3g}", "is another spot on it"
+        worst, share, cause = f"({worst})", f"a weight of {played[place]:.3g}", "no other spot overlaps"
     _refuse(
-        f"the separable spread stays at {spreads[-1]:.2%}; the spots of {name} {worst} have "
-        f"{math.exp(off_by[place]):.3g} times the power of the others at {share}: "
-        f"do they follow it, or {cause}?"
+        f"the separable spread stays at {spreads[-1]:.2%}, and the spots of {name} {worst} have "
+        f"{math.exp(off_by[place]):.3g} times the power of the others at {share}; "
+        f"check that they follow it and that {cause}"
     )
 
 
@@ -335,11 +335,10 @@ READINGS: Final = "equalise."
 
 
 class EqualiseStep(Step):
-    """Measures the power of each static tweezer, and corrects the rows' and columns' tones until it is even.
+    """Measures the power of each static tweezer, and corrects the tones of rows and columns until it is even.
 
-    Where the static tweezers have a weight for each site it corrects these instead.
-
-    A camera measures, or another device of the profile; see :class:`labseq.builtin.spot_powers.TweezerMeter`.
+    If the static tweezers have a weight for each site, it corrects the weights instead. The meter is a camera
+    or another device of the profile (see :class:`labseq.builtin.spot_powers.TweezerMeter`).
     """
 
     takes_time = False
@@ -355,10 +354,10 @@ class EqualiseStep(Step):
         return [TimelineEntry(f"equalise by {self.settings.device}", 0.0, 0.0)]
 
     def run(self, shot: Shot) -> None:
-        """Turn the array on and run the loop; its result stays in use and is recorded in the shot's readings.
+        """Turn the array on and run the loop. Its result stays in use and is recorded in the shot's readings.
 
         Raises:
-            DeviceError: The loop does not converge, and why; or the device's value is not such an array.
+            DeviceError: The loop does not converge, or the device's value does not have the right shape.
         """
         settings, before = self.settings, list[Floats]()
         is_mobile = settings.tweezers == "mobile"
@@ -390,14 +389,14 @@ class EqualiseStep(Step):
 
 
 def _weights_in_force(shot: Shot) -> tuple[Floats]:
-    """The weights to begin with: those of the calibration; else all equal."""
+    """The initial weights, from the calibration or all equal."""
     entry = shot.calibrations.get("tweezers")
     weights = None if entry is None else entry.values.get("weights")
     return (np.ones(shot.grid.shape) if weights is None else weights,)
 
 
 def _in_force(shot: Shot) -> tuple[Floats, Floats]:
-    """The amplitudes to begin with: those of the calibration; else all equal, adding up to full scale."""
+    """The initial amplitudes, from the calibration, or all equal with a sum of full scale."""
     entry = shot.calibrations.get("tweezers")
     if entry is not None:
         return entry.values["row_amplitudes"], entry.values["column_amplitudes"]
@@ -406,5 +405,5 @@ def _in_force(shot: Shot) -> tuple[Floats, Floats]:
 
 
 def _mobile_in_force(shot: Shot) -> tuple[Floats, Floats]:
-    """The amplitudes of the mobile tweezers' tones: calibrated, of the profile, or all equal."""
+    """The amplitudes of the mobile tweezers' tones, from the calibration or the profile, or all equal."""
     return drive(shot.grid, shot.motion, 0).amplitude, drive(shot.grid, shot.motion, 1).amplitude

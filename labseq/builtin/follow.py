@@ -1,4 +1,4 @@
-"""The step ``wait: {for: go}``, loaded where another control system leads."""
+"""The step ``wait: {for: go}``, loaded only if another control system leads."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class FollowStep(Step):
         return {}
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - of the role
-        """One entry, at most the timeout; the lines are idle, because the length of the wait is unknown."""
+        """One entry, at most the timeout. The lines are idle, because the length of the wait is unknown."""
         return [TimelineEntry(f"wait for {self.signal}", self.timeout_s, 0.0)]
 
     def run(self, shot: Shot) -> None:

@@ -1,9 +1,9 @@
 """The offset of the mobile tweezers from the sites, from the survival of pick-up, hold and drop.
 
-A probe commands an offset, to which the unknown offset of the tweezers adds. Atoms survive best at
-the *centre*, where both cancel: so the tweezers are away from the sites by minus the centre
-(:func:`overlay_offset`). Around a site, the *survival peak* is surrounded by a ring of loss, beyond
-which the tweezer does not capture the atom and it survives again.
+A probe commands an offset, which adds to the unknown offset of the tweezers. Atoms survive best at the
+*centre*, where both cancel, so the tweezers are displaced from the sites by minus the centre
+(:func:`overlay_offset`). Around a site, the *survival peak* is surrounded by a ring of loss. Beyond the ring
+the tweezer does not capture the atom, and it survives again.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 MIN_P: Final = 1e-4
-"""Probabilities are clipped this near to 0 and 1: the rate of false detections."""
+"""Rate of false detections. Probabilities are kept this far from 0 and 1."""
 
 
 REACH: Final = 1.5
-"""In half-widths: half survive at about a waist; from 1.6 waists on, wells of 2.1 and 0.3 mK are two."""
+"""In half-widths. Half survive at about a waist, and from 1.6 waists wells of 2.1 and 0.3 mK are separate."""
 
 
 @dataclass(frozen=True, slots=True)
 class SurvivalShape:
     """The survival peak around a site.
 
-    An atom picked up and dropped near its site survives; one that is dropped on the slope of
-    the site's light is lost. Far away from the site the mobile tweezer does not capture the atom,
-    which survives again; this outer side of the ring of loss is not described here.
+    An atom picked up and dropped near its site survives. An atom dropped on the slope of the site's light is
+    lost. Far away from the site the mobile tweezer does not capture the atom, which survives again. This
+    outer side of the ring of loss is not described here.
 
     Attributes:
-        half_width_m: Distance at which survival is half way between floor and ceiling.
-        edge_m: Width of its edge, 1 sigma of the error function.
+        half_width_m: Distance at which survival is half-way between floor and ceiling.
+        edge_m: Width of the peak's edge, 1 sigma of the error function.
         floor: Survival in the ring.
         ceiling: Survival at the centre.
     """
@@ -53,7 +53,7 @@ class SurvivalShape:
 
     @property
     def reach_m(self) -> float:
-        """Distance up to which the shape is valid, inside of the ring's outer side."""
+        """Distance up to which the shape is valid, before the outer side of the ring."""
         return REACH * self.half_width_m
 
     def survival(self, distance_m: ArrayLike) -> Floats:
@@ -80,7 +80,7 @@ class SurvivalShape:
 
     @classmethod
     def from_values(cls, values: Mapping[str, ArrayLike]) -> SurvivalShape | None:
-        """The shape stored in a calibration; None if there is none."""
+        """The shape stored in a calibration, or None."""
         names = ("half_width_m", "edge_m", "floor", "ceiling")
         if any(name not in values for name in names):
             return None
@@ -88,7 +88,7 @@ class SurvivalShape:
 
 
 def unit_axes(grid: SiteGrid) -> Floats:
-    """Directions of a1 and a2, float64 (2, 2): an offset times them is the displacement from the site.
+    """Directions of a1 and a2, float64 (2, 2). Times an offset, they give the displacement from the site.
 
     Example:
         >>> unit_axes(SiteGrid(2, 2)).round(3).tolist()
@@ -109,7 +109,7 @@ def distance_m(offset_m: Floats, axes: Floats) -> Floats:
 
 
 def deviance_residuals(n_survived: Floats, n_before: Floats, p: Floats) -> Floats:
-    """Signed roots of the binomial deviance; the sum of squares is minimal at the maximum likelihood."""
+    """Signed roots of the binomial deviance. Their sum of squares is minimal at the maximum likelihood."""
     from scipy.special import xlog1py
 
     p = np.clip(p, MIN_P, 1 - MIN_P)
@@ -120,14 +120,14 @@ def deviance_residuals(n_survived: Floats, n_before: Floats, p: Floats) -> Float
 
 
 def covariance(theta: Floats, n_before: Floats, model: Callable[[Floats], Floats], prior: Floats) -> Floats:
-    """Covariance of parameters fitted to binomial counts: the inverse of the Fisher information.
+    """Covariance of parameters fitted to binomial counts, as the inverse of the Fisher information.
 
     Args:
         theta: float64 (n,), the parameters.
         n_before: float64 (n_points,), atoms that were probed.
         model: Parameters -> probability of survival, float64 (n_points,).
-        prior: float64 (n,), prior uncertainty of each parameter, 1 sigma; it keeps the
-            inverse finite for parameters that the counts do not determine.
+        prior: float64 (n,), prior uncertainty of each parameter, 1 sigma. It keeps the inverse finite for
+            parameters that the counts do not determine.
     """
     jacobian = slopes(theta, model, 1e-4 * prior)
     p = np.clip(model(theta), MIN_P, 1 - MIN_P)
@@ -148,7 +148,7 @@ def slopes(theta: Floats, model: Callable[[Floats], Floats], step: Floats) -> Fl
 
 
 def dispersion(n_survived: Floats, n_before: Floats, p: Floats, n_parameters: int) -> float:
-    """Scatter of counts over that of binomial ones: Pearson's chi squared per degree of freedom, at least 1.
+    """Pearson's chi squared per degree of freedom of binomial counts, at least 1.
 
     Losses common to the atoms of a shot increase it.
     """
@@ -181,9 +181,9 @@ class OverlayFit:
     Attributes:
         centre_m: float64 (2,), commanded offset at which survival is best, along a1 and a2.
         error_m: float64 (2,), its standard errors, including the scatter of the counts.
-        shape: The survival peak around it.
-        dispersion: Scatter of the counts over that of a binomial distribution, at least 1.
-        n_atoms: Atoms that were probed.
+        shape: The survival peak around the centre.
+        dispersion: Scatter of the counts relative to a binomial distribution, at least 1.
+        n_atoms: Number of probed atoms.
     """
 
     centre_m: Floats
@@ -194,10 +194,10 @@ class OverlayFit:
 
 
 def overlay_offset(centre_m: ArrayLike, in_use_m: ArrayLike = (0.0, 0.0)) -> Floats:
-    """The offset of the mobile tweezers from the sites: ``offset_m`` of an overlay calibration.
+    """The offset of the mobile tweezers from the sites, which is ``offset_m`` of an overlay calibration.
 
     Args:
-        centre_m: float64 (2,), the commanded offset that puts them onto the sites.
+        centre_m: float64 (2,), the commanded offset that puts the tweezers onto the sites.
         in_use_m: The ``offset_m`` that was corrected in the measurement.
 
     Example:
@@ -216,31 +216,29 @@ def fit_overlay(
 ) -> OverlayFit:
     """Find the centre of the survival peak, by maximum likelihood of binomial counts.
 
-    The peak is round and has a flat top and an edge; see :class:`SurvivalShape`. On the triangular
-    lattice the axes are not at right angles: an offset along one moves the best place along the
-    other, so both are fitted together.
+    The peak is round and has a flat top and an edge (see :class:`SurvivalShape`). On the triangular lattice
+    the axes are not orthogonal. An offset along one axis moves the best place along the other, so both are
+    fitted together.
 
     Args:
         offset_m: float64 (n_points, 2), commanded offsets along a1 and a2.
-        n_before: int (n_points, ...), atoms that were probed at each; perhaps per row or site.
-        n_survived: int, of the same shape: how many of them were seen afterwards.
+        n_before: int (n_points, ...), number of probed atoms at each offset, in total or per row or site.
+        n_survived: int, of the same shape, number of these atoms seen afterwards.
         grid: The grid of sites, for its axes.
         worst_error_m: Maximum error of the centre.
 
     Raises:
-        DeviceError: There is no survival peak, one of its edges is not in range (it says in which
-            direction to scan on), or there are too few atoms.
+        DeviceError: There is no survival peak, one of its edges is out of range (the message says in which
+            direction to continue), or there are too few atoms.
         ValueError: The arrays have different shapes.
     """
     offset, n, k = checked_counts(offset_m, n_before, n_survived)
     n, k = n.reshape(len(n), -1).sum(axis=1), k.reshape(len(k), -1).sum(axis=1)
     if n.sum() < MIN_ATOMS:
-        _refuse(f"only {int(n.sum())} atoms were probed; expected {MIN_ATOMS} at least: set more `repeats`")
+        _refuse(f"only {int(n.sum())} atoms were probed, but {MIN_ATOMS} are needed; increase `repeats`")
     for axis, direction in enumerate(DIRECTIONS):
         if len(np.unique(offset[:, axis].round(9))) < 5:
-            _refuse(
-                f"the offset {direction} has fewer than 5 values; scan it across the sites, to both sides"
-            )
+            _refuse(f"the offset {direction} has fewer than 5 values; scan it to both sides of the sites")
     fit = _best_fit(offset / UM, n, k, unit_axes(grid))
     if fit.error_m.max() > worst_error_m:  # a peak in the middle of the scan can look like a narrower one
         other = _best_fit(offset / UM, n, k, unit_axes(grid), 1.6)
@@ -251,7 +249,7 @@ def fit_overlay(
         more = math.ceil((worst / worst_error_m) ** 2)
         error, error_limit = format_quantity(worst, "length"), format_quantity(worst_error_m, "length")
         remedy = f"for {error_limit} take {more} times as many `repeats`"
-        _refuse(f"too few atoms: the centre is known to {error} only; {remedy}")
+        _refuse(f"there are too few atoms, as the centre is only known to {error}; {remedy}")
     return fit
 
 
@@ -261,18 +259,18 @@ def checked_counts(
     """Offsets and counts as float64.
 
     Raises:
-        ValueError: They do not belong together.
+        ValueError: The arrays do not belong together.
     """
     offset, n, k = (np.asarray(values, np.float64) for values in (offset_m, n_before, n_survived))
     if offset.ndim != 2 or offset.shape[1] != 2 or n.shape != k.shape or n.shape[:1] != offset.shape[:1]:
-        raise ValueError(f"offsets {offset.shape} and counts {n.shape}, {k.shape} do not belong together")
+        raise ValueError(f"the shapes of offsets {offset.shape} and counts {n.shape}, {k.shape} do not match")
     if not (np.isfinite(offset).all() and np.isfinite(n).all() and np.all((k >= 0) & (k <= n))):
-        raise ValueError("offsets are numbers, and no more atoms survive than there were")
+        raise ValueError("offsets must be finite, and no more atoms may survive than there were")
     return offset, n, k
 
 
 def _best_fit(offset: Floats, n: Floats, k: Floats, axes: Floats, wider: float = 1.0) -> OverlayFit:
-    """Fit the peak to the points in its reach; offsets are in micrometres, and ``wider`` is of the start."""
+    """Fit the peak to the points in its reach, in micrometres. ``wider`` scales the width at the start."""
     n_atoms, share = int(n.sum()), format_quantity(k.sum() / n.sum(), "fraction")
     theta, within = _start(offset, n, k, axes), np.empty(0, np.bool_)
     theta[2:4] *= wider
@@ -288,8 +286,8 @@ def _best_fit(offset: Floats, n: Floats, k: Floats, axes: Floats, wider: float =
     # a survival peak must explain the counts better by this much, relative to their scatter
     if gain < 30.0 * excess or theta[5] - theta[4] < MIN_CONTRAST:
         _refuse(
-            f"no survival peak: at no offset do clearly more atoms survive than around it ({share} in all); "
-            "scan further, and check whether the mobile tweezers are on"
+            f"there is no survival peak, because no offset has clearly more survivors ({share} in all); "
+            "scan further, and check that the mobile tweezers are on"
         )
     spread = covariance(theta, n, lambda t: _survival(t, offset, axes), _KNOWN_BEFORE) * excess
     return OverlayFit(theta[:2] * UM, np.sqrt(np.diag(spread)[:2]) * UM, _shape(theta, UM), excess, n_atoms)
@@ -317,7 +315,7 @@ def _survival(theta: Floats, offset: Floats, axes: Floats) -> Floats:
 
 
 def _start(offset: Floats, n: Floats, k: Floats, axes: Floats) -> Floats:
-    """Start of the fit: the best of many peaks, with and without the outer side of the ring of loss."""
+    """Start of the fit, the best of many peaks with and without the outer side of the ring of loss."""
     low, high = offset.min(axis=0), offset.max(axis=0)
     span = float((high - low).max())
     centres = np.stack(np.meshgrid(*np.linspace(low, high, 17).T), axis=-1).reshape(-1, 2)
@@ -356,8 +354,8 @@ def _refuse_open_ends(fit: OverlayFit, offset: Floats, axes: Floats) -> None:
         if best - half < low or best + half > high:
             end, sign = (low, "-") if best - half < low else (high, "+")
             _refuse(
-                f"only one edge of the survival peak is in range {direction}: survival has not fallen at "
-                f"{format_quantity(float(end), 'length')}; scan on in the direction {sign}, or about {centre}"
+                f"only one edge of the survival peak is in range {direction}, as survival has not fallen at "
+                f"{format_quantity(float(end), 'length')}; continue in direction {sign}, or about {centre}"
             )
 
 
@@ -366,7 +364,7 @@ def _refuse(why: str) -> NoReturn:
 
 
 DRIFT: Final = 0.1
-"""Relative change of the half-width since it was measured, 1 sigma, for example by temperature."""
+"""Relative change of the half-width since its measurement, 1 sigma, for example with temperature."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -376,8 +374,8 @@ class FastOffset:
     Attributes:
         offset_m: float64 (2,), in addition to the active correction, along a1 and a2.
         error_m: float64 (2,), its standard errors.
-        n_atoms: Atoms that were probed.
-        deviance: Deviance of the counts from the peak at the best offset; about 1 if they agree.
+        n_atoms: Number of probed atoms.
+        deviance: Deviance of the counts from the peak at the best offset. About 1 if they agree.
     """
 
     offset_m: Floats
@@ -388,12 +386,12 @@ class FastOffset:
     @property
     def fits(self) -> bool:
         """Whether the counts agree with the survival peak."""
-        # with four groups and three parameters, one in a million is larger; common losses increase it
+        # with four groups and three parameters, one in a million is larger, but common losses increase it
         return self.deviance < 25.0
 
     @property
     def length_m(self) -> float:
-        """The larger of both components, in metres; nan if they are not known."""
+        """The larger of both components, in metres. nan if they are not known."""
         return float(np.abs(self.offset_m).max())
 
 
@@ -406,15 +404,15 @@ def fast_offset(
 ) -> FastOffset:
     """Find the offset of the mobile tweezers from a few probes on the edge of a known survival peak.
 
-    By maximum likelihood; the half-width may have drifted by :data:`DRIFT`. With offsets of +x and
-    -x, +y and -y on the edge, a shift by a small fraction of its width makes one group of each
-    pair survive more often and the other less. A shift by half the half-width and more cannot be
-    measured in this way: the result is then wrong but not small, or does not fit.
+    The fit is by maximum likelihood, and the half-width may have drifted by :data:`DRIFT`. With offsets of +x
+    and -x, +y and -y on the edge, a shift by a small fraction of its width makes one group of each pair
+    survive more often and the other less often. A shift by half the half-width or more cannot be measured in
+    this way. The result is then wrong but not small, or does not fit.
 
     Args:
         offset_m: float64 (n_groups, 2), commanded offsets along a1 and a2.
-        n_before: int (n_groups,), atoms that were probed.
-        n_survived: int (n_groups,), how many of them were seen afterwards.
+        n_before: int (n_groups,), number of probed atoms.
+        n_survived: int (n_groups,), number of these atoms seen afterwards.
         shape: The survival peak, from the last overlay calibration.
         grid: The grid of sites, for its axes.
 
@@ -449,7 +447,7 @@ def group_counts(
     Args:
         offset_m: float64 (n_rows, n_cols, 2), offset of each site, or (2,) for all.
         before: bool (n_rows, n_cols), the atoms that were probed.
-        after: bool (n_rows, n_cols), those seen afterwards.
+        after: bool (n_rows, n_cols), the atoms seen afterwards.
 
     Returns:
         The offsets, float64 (n_groups, 2), and the atoms before and after, int64 (n_groups,).
@@ -467,10 +465,10 @@ def group_counts(
 
 
 def _least(residuals: Callable[[Floats], Floats], reach: float) -> Floats:
-    """Centre and drift with the least sum of squares, starting at the best of a grid of centres."""
+    """Centre and drift with the least sum of squares, starting from the best of a grid of centres."""
     from scipy.optimize import least_squares
 
-    places = reach * np.arange(-7, 8) / 7  # exactly 0: rounding errors would make the first step tiny
+    places = reach * np.arange(-7, 8) / 7  # exactly 0, as rounding errors would make the first step tiny
     starts = [np.array([along, across, 0.0]) for along in places for across in places]
     start = min(starts, key=lambda theta: float((residuals(theta) ** 2).sum()))
     bounds = np.array([1.5 * reach, 1.5 * reach, 5 * DRIFT])

@@ -17,7 +17,7 @@ from labseq.plugin.messages import visible
 from labseq.text_files import decode, read_bytes
 
 MAX_PIXELS: Final = 1024
-"""Longest side of a picture, in pixels: far more than any grid has sites."""
+"""Longest side of a picture, in pixels, far more than the sites of any grid."""
 
 MAX_BYTES: Final = 1 << 20
 """Largest file with a drawing, in bytes."""
@@ -29,7 +29,7 @@ class DrawingError(ValueError):
     """An error in a drawing.
 
     Attributes:
-        line: The line of the text that is wrong, from 1; 0 for an error of the whole drawing.
+        line: The wrong line of the text, from 1. 0 for an error of the whole drawing.
     """
 
     def __init__(self, message: str, line: int = 0) -> None:
@@ -38,17 +38,17 @@ class DrawingError(ValueError):
 
 
 def read_bitmap(drawing: str, fill: str = "#") -> NDArray[np.bool_]:
-    """Read a drawing, one line per row; empty lines before and after it do not count.
+    """Read a drawing with one line per row. Empty lines before and after it are ignored.
 
     Args:
         drawing: The drawing.
-        fill: Characters that stand for an atom; all others stand for none.
+        fill: Characters that mean an atom. All others mean no atom.
 
     Returns:
         bool (rows, cols).
 
     Raises:
-        DrawingError: The drawing is empty, holds no atom, or its rows differ in length.
+        DrawingError: The drawing is empty, has no atom, or its rows differ in length.
 
     Example:
         >>> read_bitmap("#.#").astype(int).tolist()
@@ -62,30 +62,30 @@ def read_bitmap(drawing: str, fill: str = "#") -> NDArray[np.bool_]:
     for row, line in enumerate(drawn, start=1):
         if len(line) != len(drawn[0]):
             raise DrawingError(
-                f"row {row} of the drawing has {len(line)} characters and row 1 has {len(drawn[0])}; "
-                "every row must have the same number",
+                f"row {row} of the drawing has {len(line)} characters, but row 1 has {len(drawn[0])}; "
+                "make all rows equally long",
                 first + row,
             )
     mask = np.array([[character in fill for character in line] for line in drawn], np.bool_)
     if not mask.any():
-        raise DrawingError(f"the drawing holds no atom; draw an atom as one of '{fill}', or set `fill`")
+        raise DrawingError(f"the drawing has no atom; draw an atom as one of '{fill}', or set `fill`")
     return mask
 
 
 def read_drawing(path: Path, fill: str = "#") -> NDArray[np.bool_]:
     """Read a pattern that is drawn in a file.
 
-    A file whose name ends in .png is a picture; any other is text.
+    A file whose name ends in .png is a picture. Any other file is text.
 
     Args:
         path: The file.
-        fill: Characters that stand for an atom, in a text.
+        fill: Characters that mean an atom, in a text.
 
     Returns:
         bool (rows, cols), True where an atom must be.
 
     Raises:
-        ConfigError: It cannot be read, or it is not a drawing; with the line that is wrong.
+        ConfigError: The file cannot be read, or is not a drawing. The error has the wrong line.
     """
     data = read_bytes(path, "a text file or a PNG", (".txt", ".png"), MAX_BYTES)
     name = visible(str(path))
@@ -99,7 +99,7 @@ def read_drawing(path: Path, fill: str = "#") -> NDArray[np.bool_]:
 
 
 def _picture(data: bytes, name: str) -> NDArray[np.bool_]:
-    """Dark pixels are atoms; in a picture with transparent pixels, opaque ones."""
+    """Atoms are dark pixels, or in a picture with transparent pixels the opaque pixels."""
     try:
         from PIL import Image
     except ImportError:
@@ -112,7 +112,7 @@ def _picture(data: bytes, name: str) -> NDArray[np.bool_]:
             if max(image.size) > MAX_PIXELS:
                 fault = f"the picture has {image.height} x {image.width} pixels"
                 raise ConfigError(Problem(fault, name, expected="one pixel per site", hint="scale it down"))
-            # Grey levels of 16 bits fit into no other mode; the upper 8 are enough.
+            # Grey levels of 16 bits fit into no other mode, and the upper 8 bits are enough.
             grey = np.asarray(image) // 257 if image.mode.startswith("I") else np.asarray(image.convert("L"))
             opacity = np.asarray(cast("Any", image).convert("RGBA"))[..., 3]
     except ConfigError:
@@ -124,7 +124,7 @@ def _picture(data: bytes, name: str) -> NDArray[np.bool_]:
     mask = opacity >= _HALF if opacity.min() < _HALF else grey < _HALF
     if not mask.any():
         hint = "make the pixels of atoms dark, or all others transparent"
-        raise ConfigError(Problem("the picture holds no atom", name, hint=hint))
+        raise ConfigError(Problem("the picture has no atom", name, hint=hint))
     return mask
 
 
@@ -163,35 +163,35 @@ class BitmapSettings(Settings):
     """
 
     sites: str | None = Field(
-        default=None, description="the drawing: one line of text per row, all of the same length"
+        default=None, description="the drawing, with one line of text per row, all of the same length"
     )
     file: FilePath | None = Field(
         default=None,
-        description="a file with the drawing, instead of sites: text, or a PNG with one pixel per site",
+        description="a file with the drawing, instead of sites, as text or as a PNG with one pixel per site",
     )
     fill: str = Field(
         default="#",
         min_length=1,
-        description="characters of a text that stand for an atom; all others are empty sites",
+        description="characters of a text that mean an atom. All others are empty sites",
     )
     origin: tuple[Index, Index] | None = Field(
         default=None, description="[row, column] of its top left site, from 0; centred if left out"
     )
     clear: Literal["bounding_box", "none"] = Field(
         default="bounding_box",
-        description="bounding_box: all other sites of the drawing must be empty; none: they are reservoir",
+        description="`bounding_box` if all other sites of the drawing must be empty, else `none`",
     )
     _mask: NDArray[np.bool_] = PrivateAttr()
 
     @property
     def mask(self) -> NDArray[np.bool_]:
-        """What is drawn: bool (rows, cols), True where an atom must be."""
+        """The drawing, bool (rows, cols), True where an atom must be."""
         return self._mask
 
     @model_validator(mode="after")
     def _read(self) -> Self:
         if self.sites is not None and self.file is not None:
-            raise setting_error("'file' excludes 'sites'", "one of them", at=("file",), key=True)
+            raise setting_error("'file' and 'sites' are both given", "one of them", at=("file",), key=True)
         if self.file is not None:
             try:
                 self._mask = read_drawing(self.file, self.fill)
@@ -208,7 +208,7 @@ class BitmapSettings(Settings):
 
 
 def bitmap(settings: BitmapSettings, grid: SiteGrid) -> TargetPattern:
-    """Sites as they are drawn; the bounding box is the whole drawing, margins included.
+    """Sites as they are drawn. The bounding box is the whole drawing, margins included.
 
     Raises:
         LimitError: It is larger than the grid or sticks out of it.

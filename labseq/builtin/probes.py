@@ -33,7 +33,7 @@ from labseq.plugin import (
 )
 
 PositiveLength: TypeAlias = Annotated[Length, Field(gt=0)]
-"""Metres, more than 0; "0.9 um"."""
+"""A length above 0, such as "0.9 um", in metres."""
 
 
 class ProbeSettings(Settings):
@@ -41,26 +41,26 @@ class ProbeSettings(Settings):
 
     offset: tuple[Length, Length] = Field(
         default=(0.0, 0.0),
-        description="[along a row, from row to row]: displacement of the tweezers from the sites",
+        description="displacement of the tweezers from the sites, as [along a row, from row to row]",
     )
     hold: Duration = Field(default=0.2e-3, description="time between pick-up and drop-off")
     drop_off: Duration = Field(
-        default=5e-6, description="duration of the drop-off; a slow one leads atoms back to their sites"
+        default=5e-6, description="duration of the drop-off. A slow drop-off leads atoms back to their sites"
     )
     pattern: Literal["same", "cross"] = Field(
         default="same",
-        description="the offset of each site: the same for all, or in four groups of sites forwards and "
-        "backwards along a row, forwards and backwards from row to row",
+        description="whether all sites have the same offset, or four groups are displaced forwards and "
+        "backwards along a row, and forwards and backwards from row to row",
     )
     sites: Literal["seen", "all"] = Field(
-        default="seen", description="which sites are probed: where the last image saw an atom, or all"
+        default="seen", description="sites to probe: where the last image shows an atom, or all"
     )
 
 
 class ProbeStep(Step):
     """Picks atoms up, holds them and sets them down, displaced from their sites by an offset.
 
-    The survival, seen on an image after it, depends on where the mobile tweezers are.
+    The survival on the next image shows where the mobile tweezers are.
     """
 
     needs_image = True
@@ -81,7 +81,7 @@ class ProbeStep(Step):
         return [TimelineEntry("probe", duration_s, min_duration_s, timed_by=TimedBy("mobile_tweezers"))]
 
     def run(self, shot: Shot) -> None:
-        """Hold the atoms that were seen on the last image, or those of all sites."""
+        """Hold the atoms on the last image, or probe all sites."""
         occupancy = shot.occupancy
         if occupancy is None:
             raise ConfigError("probe needs an image before it in the shot")
@@ -105,9 +105,9 @@ def hold(
 
     Args:
         shot: The running shot.
-        sites: bool (n_rows, n_cols); without any, nothing is played.
+        sites: bool (n_rows, n_cols). Without sites, nothing is played.
         offsets_m: float64 (n_rows, n_cols, 2), along a1 and a2.
-        settings: For how long.
+        settings: Durations of hold and drop-off.
     """
     if sites.any():
         start_s = shot.clock.now()
@@ -130,15 +130,15 @@ def longest_s(
 Exceeded = Literal["warn", "stop"]
 
 MIN_ATOMS: Final = 10
-"""With fewer, noise may be taken for displaced atoms."""
+"""Minimum number of atoms, because with fewer, noise may look like displaced atoms."""
 SURE: Final = 1.0
-"""A shift counts as too large if it exceeds the limit by this many of its errors."""
+"""A shift counts as too large if it exceeds the limit by this many standard errors."""
 
 
 class CheckSitesSettings(Settings):
     """``check_sites``: check on the last image whether the sites have moved on the camera."""
 
-    every: int = Field(default=1, ge=1, description="check one in this many shots, from the first")
+    every: int = Field(default=1, ge=1, description="check once in this many shots, from the first")
     limit_px: float = Field(default=0.5, gt=0, description="largest shift that is accepted, in pixels")
     spot_px: float = Field(
         default=1.2, gt=0, description="width (1 sigma of a Gaussian) of an atom's image, in pixels"
@@ -160,7 +160,7 @@ class CheckSitesStep(Step):
         self.settings = settings
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - of the role
-        """One entry without a length: it takes some milliseconds of the computer's time."""
+        """One entry without a length. The check takes some milliseconds of the computer's time."""
         return [TimelineEntry("check sites", 0.0, 0.0)]
 
     def run(self, shot: Shot) -> None:
@@ -178,7 +178,7 @@ class CheckSitesStep(Step):
         if not isinstance(detector, ReportsSignals):
             raise ConfigError(
                 "check_sites needs a detector that reports where it looks for the atoms; "
-                "'threshold' and 'weighted' do"
+                "use 'threshold' or 'weighted'"
             )
         image, sites_px = shot.frame.image, detector.sites_px[shot.occupancy]
         dy = dx = error = math.inf
@@ -191,8 +191,8 @@ class CheckSitesStep(Step):
         if not error <= settings.limit_px:
             _warn(
                 shot,
-                f"check_sites cannot locate the sites with {len(sites_px)} atoms seen on them: "
-                "few were loaded, or the sites are far from where the detector looks",
+                f"check_sites cannot locate the sites from {len(sites_px)} atoms, because "
+                "few were loaded or the sites are far from where the detector looks",
             )
             return
         for name, value in (("shift_y_px", dy), ("shift_x_px", dx), ("shift_error_px", error)):
@@ -203,21 +203,21 @@ class CheckSitesStep(Step):
                 settings.exceeded,
                 "camera",
                 f"the sites have moved by {dy:+.2f} px down and {dx:+.2f} px to the right on the frame "
-                f"(+-{error:.2f}); the limit is {settings.limit_px:g} px: run `labseq calibrate sites`",
+                f"(+-{error:.2f}, limit {settings.limit_px:g} px); run `labseq calibrate sites`",
             )
 
 
 class CheckOverlaySettings(Settings):
     """``check_overlay``: check by a probe whether the mobile tweezers are still centred on the sites."""
 
-    every: int = Field(default=20, ge=1, description="check one in this many shots, from the first")
+    every: int = Field(default=20, ge=1, description="check once in this many shots, from the first")
     offset: PositiveLength = Field(
         default=0.9e-6,
-        description="offset of the probe in each of four directions: on the edge of the survival peak",
+        description="offset of the probe in each of four directions, on the edge of the survival peak",
     )
     hold: Duration = Field(default=0.2e-3, description="time between pick-up and drop-off")
     drop_off: Duration = Field(
-        default=5e-6, description="duration of the drop-off; a slow one leads atoms back to their sites"
+        default=5e-6, description="duration of the drop-off. A slow drop-off leads atoms back to their sites"
     )
     exposure: PositiveDuration = Field(default=45e-3, description="exposure time of the image after it")
     limit: PositiveLength = Field(default=100e-9, description="largest offset that is accepted, on each axis")
@@ -236,7 +236,7 @@ class CheckOverlaySettings(Settings):
 class CheckOverlayStep(Step):
     """Checks by probing four groups of sites whether the mobile tweezers are still centred on the sites.
 
-    It loses the probed atoms, so it comes after everything else, in one of `every` shots.
+    It loses the probed atoms, so it should be the last step. It runs in one of `every` shots.
     """
 
     needs_image = True
@@ -303,12 +303,12 @@ class CheckOverlayStep(Step):
         if not overlay.fits:
             message = "the survival of the probed atoms fits no small offset of the mobile tweezers"
             _handle_exceeded(
-                shot, settings.exceeded, "mobile_tweezers", f"{message}: run `labseq calibrate overlay`"
+                shot, settings.exceeded, "mobile_tweezers", f"{message}; run `labseq calibrate overlay`"
             )
         elif (offset_m > settings.limit + SURE * error_m).any():
-            message = f"the mobile tweezers are {parts} from the sites; the limit is {limit}"
+            message = f"the mobile tweezers are {parts} from the sites, more than the limit of {limit}"
             _handle_exceeded(
-                shot, settings.exceeded, "mobile_tweezers", f"{message}: run `labseq calibrate overlay`"
+                shot, settings.exceeded, "mobile_tweezers", f"{message}; run `labseq calibrate overlay`"
             )
         elif not (error_m <= settings.limit).all():
             n_atoms = "1 atom" if overlay.n_atoms == 1 else f"{overlay.n_atoms} atoms"

@@ -1,4 +1,4 @@
-"""The step `pulse`: lines that a timing box switches within one step, exactly."""
+"""The step `pulse`: lines switched within one step, with the exact times of a timing box."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from labseq.plugin import (
 from labseq.plugin.messages import one_of
 
 MAX_PULSES = 10_000
-"""Most pulses of a step, repetitions counted: more than any box can play."""
+"""Maximum number of pulses of a step, repetitions included, which is more than any box can play."""
 ROUNDING = 1e-6
-"""Part of the box's resolution by which a duration may miss a multiple of it."""
+"""Allowed deviation of a duration from a multiple of the box's resolution, relative to it."""
 
 
 class Played(NamedTuple):
     """A time during which nothing changes.
 
     Attributes:
-        place: Where its settings are within those of the step: "parts.dark."; "" for the step itself.
+        place: Place of its settings within the step's, such as "parts.dark.". "" for the step itself.
         lines: The lines that are on.
-        duration_s: How long, in seconds.
+        duration_s: Duration, in seconds.
     """
 
     place: str
@@ -48,12 +48,12 @@ class Played(NamedTuple):
 
 
 class PulseOfBlock(Settings):
-    """A pulse of a block that is repeated."""
+    """A pulse in a repeated block."""
 
     lines: Annotated[tuple[Text, ...], empty_is(())] = Field(
-        default=(), description="lines of the profile that are on; none: a pause"
+        default=(), description="lines of the profile that are on. Without lines it is a pause"
     )
-    duration: Duration = Field(description="how long; with 0 it is left out")
+    duration: Duration = Field(description="duration of the pulse. With 0 it is left out")
 
     @property
     def n_played(self) -> int:
@@ -61,7 +61,7 @@ class PulseOfBlock(Settings):
         return 1
 
     def played(self, place: str = "") -> Iterator[Played]:
-        """Itself."""
+        """The pulse itself."""
         yield Played(place, self.lines, self.duration)
 
 
@@ -69,20 +69,20 @@ P = TypeVar("P", bound="PulseOfBlock | PulseOrBlock")
 
 
 class Block(Settings, Generic[P]):
-    """A pulse, or parts that follow one another and may be repeated as a whole."""
+    """A pulse, or a sequence of parts that may be repeated as a whole."""
 
     lines: Annotated[tuple[Text, ...], empty_is(())] = Field(
-        default=(), description="lines of the profile that are on; none: a pause"
+        default=(), description="lines of the profile that are on. Without lines it is a pause"
     )
-    duration: Duration | None = Field(default=None, description="how long; with 0 it is left out")
+    duration: Duration | None = Field(default=None, description="how long it lasts. With 0 it is left out")
     parts: Annotated[dict[Text, P], empty_is({})] = Field(
-        default={}, description="instead of `lines` and `duration`: name -> pulse, one after another"
+        default={}, description="instead of `lines` and `duration`, successive pulses as name -> pulse"
     )
-    repeat: int = Field(default=1, ge=1, le=MAX_PULSES, description="how often all of it is played")
+    repeat: int = Field(default=1, ge=1, le=MAX_PULSES, description="how often the whole is played")
 
     @property
     def n_played(self) -> int:
-        """Number of pulses, repetitions counted."""
+        """Number of pulses, including repetitions."""
         return self.repeat * max(1, sum(part.n_played for part in self.parts.values()))
 
     def played(self, place: str = "") -> Iterator[Played]:
@@ -100,13 +100,13 @@ class Block(Settings, Generic[P]):
         extra = next((key for key in ("duration", "lines") if key in self.model_fields_set), None)
         if self.parts and extra:
             hint = "make it a part of its own"
-            raise setting_error(f"'{extra}' beside 'parts'", "one of them", hint, at=(extra,), key=True)
+            raise setting_error(f"'{extra}' is set with 'parts'", "one of them", hint, at=(extra,), key=True)
         if self.n_played > MAX_PULSES:
-            what = f"these are {self.n_played} pulses, repetitions counted"
+            what = f"there are {self.n_played} pulses, including repetitions"
             raise setting_error(what, f"at most {MAX_PULSES}", at=("repeat",))
         if dotted := next((name for name in self.parts if "." in name), None):
             what = f"the name '{dotted}' has a dot, which separates the names of an address"
-            raise setting_error(what, "a name without", at=("parts", dotted), key=True)
+            raise setting_error(what, "a name without a dot", at=("parts", dotted), key=True)
         return self
 
 
@@ -119,7 +119,7 @@ class PulseSettings(Block[PulseOrBlock]):
 
 
 class PulseStep(Step):
-    """Plays pulses of lines as one program of the timing box, so that computer and cables delay none of them.
+    """Plays pulses of lines as one program of the timing box, so the computer cannot delay any of them.
 
     The lines that the profile turns on in the step `pulse` are on throughout.
     """
@@ -146,11 +146,11 @@ class PulseStep(Step):
         devices: Mapping[str, object],
         context: StepContext,
     ) -> Mapping[str, str | Problem]:
-        """Find lines that cannot be switched by a pulse, and durations that the box cannot make."""
+        """Report lines that a pulse cannot switch, and durations that the box cannot make."""
         if "lines" not in devices:
             fault, expected = (
-                "nothing on this profile can time pulses",
-                "a timing box: `lines` in the profile",
+                "no device of this profile can time pulses",
+                "a timing box (`lines` in the profile)",
             )
             return {"": Problem(fault, expected=expected, hint="see docs/how-to/pulses.md")}
         known = {spec.name: spec for spec in context.lines}
@@ -177,7 +177,7 @@ class PulseStep(Step):
 
 
 def _wrong_line(line: str, known: Mapping[str, LineSpec]) -> Problem | None:
-    """Why a pulse cannot switch a line; None if it can."""
+    """Why a pulse cannot switch a line, or None if it can."""
     free = [name for name, spec in known.items() if not spec.triggers]
     if line not in known:
         return Problem(f"there is no line '{line}'", expected=one_of(free), hint=did_you_mean(line, free))
@@ -187,7 +187,7 @@ def _wrong_line(line: str, known: Mapping[str, LineSpec]) -> Problem | None:
 
 
 def _wrong_duration(duration_s: float, facts: LinesFacts) -> Problem | None:
-    """Why the box cannot make a pulse of this duration; None if it can."""
+    """Why the box cannot make a pulse of this duration, or None if it can."""
     tick_s = facts.resolution_s
     n_ticks = duration_s / tick_s if tick_s else 0.0
     is_too_short = 0 < duration_s < facts.shortest_s * (1 - ROUNDING)

@@ -42,8 +42,8 @@ class RearrangeSettings(Settings):
     cycles: int = Field(default=1, ge=1, le=100, description="maximum number of cycles of plan, move, image")
     window: Duration | tuple[Duration, ...] = Field(
         default=60e-3,
-        description="longest time from the image to the end of a cycle's moves: planning, upload, start and "
-        "moves; a list gives one per cycle",
+        description="longest time from the image to the end of a cycle's moves, for planning, upload, start "
+        "and moves. A list has one time per cycle",
     )
     exposure: PositiveDuration = Field(
         default=45e-3, description="exposure time of the image that ends a cycle"
@@ -52,7 +52,8 @@ class RearrangeSettings(Settings):
         default="defect_free", description="whether to leave out further cycles once the target is met"
     )
     window_mode: Literal["early", "fixed"] = Field(
-        default="early", description="whether the image follows the last batch, or the end of the window"
+        default="early",
+        description="whether the image is taken after the last batch, or at the end of the window",
     )
 
     @model_validator(mode="after")
@@ -74,12 +75,11 @@ class RearrangeSettings(Settings):
 
 
 class RearrangeStep(Step):
-    """Rearranges in cycles; cycle k is plan, check, move, image.
+    """Rearranges atoms in cycles of plan, check, move and image.
 
-    A batch that would end after the cycle's window is not started: batches are chosen by how long it took
-    to prepare earlier programs, and once more if the device takes longer than that. With
-    ``window_mode: early`` the image follows the last batch; with ``fixed`` the
-    step waits for the end of the window.
+    A batch that would end after the cycle's window is not started. Batches are chosen with the preparation
+    times of earlier programs, and again if the device takes longer than that. With ``window_mode: early`` the
+    image follows the last batch, and with ``fixed`` the step waits for the end of the window.
     """
 
     needs_target = True
@@ -95,7 +95,7 @@ class RearrangeStep(Step):
         self._preparing = 0.0, 0.0
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
-        """Two entries per cycle, the moves at their window."""
+        """Two entries per cycle, with the window as duration of the moves."""
         exposure_s = self.settings.exposure
         image_s = exposure_s + context.camera.readout_s + context.margin_s("image")
         all_made = self.settings.stop_when == "never"
@@ -141,10 +141,10 @@ class RearrangeStep(Step):
         )
 
     def _play(self, shot: Shot, plan: Plan, report: PlanReport, cycle: int, start_s: float) -> int:
-        """Play the batches that end within the window; returns their number.
+        """Play the batches that end within the window, and return their number.
 
-        If preparing them took too long for the window, fewer are prepared. Mobile tweezers that can do so
-        start with the first batches, and the rest is made while these play.
+        If their preparation took too long for the window, fewer are prepared. If the mobile tweezers allow
+        it, they start with the first batches, and the rest is made while these play.
         """
         end_s = start_s + self.settings.window_of(cycle) - shot.margin_s("rearrange")
         duration_s, n_first, n_batches = 0.0, 0, self._n_fitting(shot, plan, report, start_s, end_s)
@@ -165,11 +165,11 @@ class RearrangeStep(Step):
             shot.log("window_too_short", cycle=cycle, **values, before_moves_s=shot.clock.now() - start_s)
         if n_batches:
             play_prepared(shot, duration_s, cycle, rest_of(shot, plan, n_first, n_batches))
-        self._preparing = preparing_time(self._measured)  # now, because the next frame must not wait for it
+        self._preparing = preparing_time(self._measured)  # now, so that the next frame need not wait for it
         return n_batches
 
     def _n_fitting(self, shot: Shot, plan: Plan, report: PlanReport, start_s: float, end_s: float) -> int:
-        """How many batches end in time, if preparing takes as long as before or as the profile says."""
+        """Number of batches that end in time, if preparation takes as long as before or as in the profile."""
         fixed_s, part = self._preparing
         left_s = max(0.0, end_s - shot.clock.now() - fixed_s)
         window_s = shot.motion.overhead_per_cycle_s + left_s / (1 + part)
@@ -179,7 +179,7 @@ class RearrangeStep(Step):
 
 
 def n_beginning(shot: Shot, plan: Plan, report: PlanReport, n_batches: int) -> int:
-    """How many batches to start with: all, if the mobile tweezers take whole programs only."""
+    """Number of batches to start with, which is all if the mobile tweezers only take whole programs."""
     played_s = report.batch_end_s[:n_batches] - shot.motion.overhead_per_cycle_s
     n_first = int(np.searchsorted(played_s, shot.mobile_tweezers.beginning_s)) + 1
     while n_first < n_batches and plan.linked[n_first]:
@@ -188,23 +188,23 @@ def n_beginning(shot: Shot, plan: Plan, report: PlanReport, n_batches: int) -> i
 
 
 def rest_of(shot: Shot, plan: Plan, start: int, stop: int) -> Callable[[], ToneProgram] | None:
-    """Makes the tone program of the batches that follow the first ones; None if there are none."""
+    """Makes the tone program of the batches after the first ones. None if there are none."""
     if start == stop:
         return None
     return partial(tone_program, plan.part(start, stop), grid=shot.grid, motion=shot.motion)
 
 
 def preparing_time(measured: Collection[tuple[float, float]]) -> tuple[float, float]:
-    """Fit how long preparing takes: a fixed time, and a part of the program's playing time.
+    """Fit the preparation time as a fixed time plus a fraction of the program's playing time.
 
-    A straight line by the medians of slopes and intercepts (Theil and Sen), so that a program during which
-    the computer was busy does not count. Programs of about equal length tell a part only.
+    The fit is a straight line from the medians of slopes and intercepts (Theil and Sen), so that a program
+    with a busy computer does not matter. Programs of about equal length only give a fraction.
 
     Args:
-        measured: Playing time and time to prepare of earlier programs, in seconds.
+        measured: Playing time and preparation time of earlier programs, in seconds.
 
     Returns:
-        The fixed time in seconds, and the part.
+        The fixed time in seconds, and the fraction.
 
     Example:
         >>> fixed_s, part = preparing_time([(0.01, 0.007), (0.02, 0.012), (0.04, 0.022)])
@@ -229,7 +229,7 @@ def checked_plan(shot: Shot, cycle: int) -> tuple[Plan, PlanReport]:
     occupancy = shot.occupancy
     assert occupancy is not None
     with shot.stage("plan", cycle=cycle):
-        copy = occupancy.copy()  # for a planner that writes into its input
+        copy = occupancy.copy()  # in case the planner writes into its input
         try:
             plan = shot.call("planner", shot.plan_timeout_s, shot.planner.plan, copy, shot.target)
         except PlanError as error:
@@ -251,7 +251,7 @@ def checked_plan(shot: Shot, cycle: int) -> tuple[Plan, PlanReport]:
 
 
 def play(shot: Shot, build: Callable[[], ToneProgram], start_s: float, cycle: int = -1) -> None:
-    """Prepare a tone program, play it and wait for its end; see :func:`prepare`."""
+    """Prepare a tone program, play it and wait for its end (see :func:`prepare`)."""
     play_prepared(shot, prepare(shot, build, start_s, cycle)[0], cycle)
 
 
@@ -260,17 +260,17 @@ def prepare(
 ) -> tuple[float, float]:
     """Build a tone program and upload it.
 
-    On a virtual clock it ends the modelled overhead of a cycle after ``start_s``, or later.
+    On a virtual clock it ends at least the modelled overhead of a cycle after ``start_s``.
 
     Args:
         shot: The running shot.
         build: Makes the program.
-        start_s: Start of the cycle on the session's clock; its overhead counts from there.
-        cycle: Index of the rearrangement cycle; -1 outside of one.
-        is_whole: Whether it is a whole program, or the beginning of one.
+        start_s: Start of the cycle and its overhead on the session's clock.
+        cycle: Index of the rearrangement cycle. -1 outside of a cycle.
+        is_whole: Whether it is a whole program, not only its beginning.
 
     Returns:
-        Its playing time, and how long it took to make and upload, in seconds.
+        Its playing time, and the time for making and uploading it, in seconds.
 
     Raises:
         LimitError: The program breaks a limit.
@@ -299,9 +299,9 @@ def play_prepared(
 
     Args:
         shot: The running shot.
-        duration_s: Playing time, with that of the rest.
-        cycle: Index of the rearrangement cycle; -1 outside of one.
-        rest: Makes the rest of a program of which the beginning was prepared.
+        duration_s: Playing time, including the rest.
+        cycle: Index of the rearrangement cycle. -1 outside of a cycle.
+        rest: Makes the rest of a program if only its beginning was prepared.
 
     Raises:
         LimitError: The rest breaks a limit.
@@ -323,7 +323,7 @@ def play_prepared(
 
 
 def _playing_time_s(answer: object) -> float:
-    """The playing time that ``prepare`` returned; every wait for the device is derived from it."""
+    """The validated playing time from ``prepare``, which sets all waiting times for the device."""
     if not (isinstance(answer, Real) and 0 <= float(answer) < math.inf):
         text = f"prepare() returned {answer!r}; expected the playing time in seconds, 0 or more"
         raise DeviceError("mobile_tweezers", text)

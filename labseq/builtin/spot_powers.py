@@ -1,4 +1,4 @@
-"""The power of each tweezer: fitted on frames of a camera, or measured by another device."""
+"""The power of each tweezer, fitted on frames of a camera or measured by another device."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 
 MIN_CONTRAST: Final = 100
-"""Counts above the median from which equal counts of several pixels mean that they are saturated."""
+"""Counts above the median at which equal counts of several pixels mean saturation."""
 
 
 NAMED: Final = 5
@@ -33,12 +33,12 @@ NAMED: Final = 5
 class SpotPowers:
     """Fits the power of each spot on frames of one camera.
 
-    The first frame gives the place of every spot and the shape that all have in common, a Gaussian. With
-    these fixed, the powers and the stray light between the spots are fitted on each frame by least squares.
-    An error of the shape changes all powers by the same factor.
+    The first frame gives the position of every spot and their common Gaussian shape. With these fixed, the
+    powers and the stray light between the spots are fitted on each frame by least squares. An error of the
+    shape changes all powers by the same factor.
 
     Args:
-        grid: The grid of sites, which must be on the frame as a whole; see :func:`find_lattice`.
+        grid: The grid of sites, which must be on the frame as a whole (see :func:`find_lattice`).
         camera: Name of the camera, for messages.
     """
 
@@ -50,7 +50,7 @@ class SpotPowers:
         """The power of each spot, float64 (n_rows, n_cols), in counts.
 
         Raises:
-            DeviceError: A spot is saturated or missing, or the spots are not a lattice such as the grid's.
+            DeviceError: A spot is saturated or missing, or the spots are not a lattice like the grid.
         """
         self._refuse_saturated(frame.image)
         spots = self._known = self._known or self._find(frame)
@@ -61,7 +61,7 @@ class SpotPowers:
         return power.reshape(self._grid.shape)
 
     def _refuse_saturated(self, image: NDArray[np.uint16]) -> None:
-        """Raise if a pixel has the largest count of 8 to 16 bits, or if several share the largest one."""
+        """Raise if a pixel has the largest count of 8 to 16 bits, or if several share the largest count."""
         highest, n_sites = int(image.max()), self._grid.n_rows * self._grid.n_cols
         n_equal = int(np.count_nonzero(image == highest))
         is_full = highest >= 0xFF and highest & (highest + 1) == 0
@@ -85,7 +85,7 @@ class SpotPowers:
         more = ", ..." if len(sites) > NAMED else ""
         fault = f"{len(sites)} of {missing.size} spots are missing or not on the lattice of the others"
         self._refuse(
-            f"{fault}: {', '.join(sites[:NAMED])}{more}; are all tones on, and is nothing in the way?"
+            f"{fault}: {', '.join(sites[:NAMED])}{more}; check that all tones are on and unobstructed"
         )
 
     def _refuse(self, why: str) -> NoReturn:
@@ -93,7 +93,7 @@ class SpotPowers:
 
 
 def without_losses(take: Callable[[], Frame]) -> Frame:
-    """Take a frame, again up to three times if it is lost on its way: no atoms have to be loaded for it."""
+    """Take a frame. If it is lost on its way, try up to three times, because no atoms are needed."""
     for _ in range(3):
         try:
             return take()
@@ -105,11 +105,11 @@ def without_losses(take: Callable[[], Frame]) -> Frame:
 class MobileTweezerMeter:
     """Plays all tones of the mobile tweezers, and measures the powers on frames of a camera.
 
-    Each frame is taken during a program of its own, with the static tweezers off.
+    Each frame is taken during its own program, with the static tweezers off.
 
     Args:
         shot: The devices.
-        settings: Which camera, and how long it exposes.
+        settings: The camera and its exposure time.
 
     Raises:
         ConfigError: The device is not a camera.
@@ -118,7 +118,7 @@ class MobileTweezerMeter:
     def __init__(self, shot: Shot, settings: PowerMeterSettings) -> None:
         self._shot, self._settings, name = shot, settings, settings.device
         if name != "camera" and not hasattr(shot.device(name), "arm"):
-            raise ConfigError(f"'{name}' is not a camera; mobile tweezers are measured on frames")
+            raise ConfigError(f"'{name}' is not a camera; choose a camera for mobile tweezers")
         self._spots = SpotPowers(shot.grid, name)
         self._motion = shot.motion
         shot.call("static_tweezers", shot.call_timeout_s, shot.static_tweezers.ramp, 0.0, 1e-3)
@@ -148,7 +148,7 @@ class MobileTweezerMeter:
 
     @contextmanager
     def _light(self, duration_s: float) -> Generator[None]:
-        """Play the prepared program to its end; within, all tones are on."""
+        """Play the prepared program to its end. All tones are on inside the context."""
         lost: TransientError | None = None
         shot, mobile, limit_s = self._shot, self._shot.mobile_tweezers, self._shot.call_timeout_s
         shot.check_interlocks()
@@ -167,14 +167,14 @@ class MobileTweezerMeter:
 class TweezerMeter:
     """Plays amplitudes of the static tweezers' tones, and measures the powers of the tweezers.
 
-    A camera measures by its frames. The value of any other device is an array (n_rows, n_cols) proportional
-    to the depths, nan where it has none; or one number proportional to the light of all tweezers. In that
-    case each row is on alone with all columns, then each column with all rows, which gives the factors of
-    rows and columns, but nothing of single tweezers.
+    The value of a device other than a camera is an array (n_rows, n_cols) proportional to the depths, nan
+    where it has none, or one number proportional to the light of all tweezers. For one number each row is
+    turned on alone with all columns, then each column with all rows. This gives the factors of rows and
+    columns, but no values of single tweezers.
 
     Args:
         shot: The devices.
-        settings: What measures.
+        settings: The measuring device.
     """
 
     def __init__(self, shot: Shot, settings: PowerMeterSettings) -> None:
@@ -186,7 +186,7 @@ class TweezerMeter:
         self._playing: tuple[Floats, ...] = ()
 
     def apply(self, *values: Floats) -> None:
-        """Play amplitudes of rows and columns, fractions of full scale; or weights of the sites."""
+        """Play amplitudes of rows and columns (fractions of full scale), or weights of the sites."""
         shot, static = self._shot, self._shot.static_tweezers
         if len(values) == 1:
             shot.call("static_tweezers", shot.call_timeout_s, static.load_weights, values[0])
@@ -213,10 +213,10 @@ class TweezerMeter:
         return self._by_tone()
 
     def _by_tone(self) -> Floats:
-        """The products of the light of each row and of each column, less that without any."""
+        """The products of the light of each row and of each column, minus the light without tones."""
         if len(self._playing) == 1:
             text = f"its value '{self._settings.value}' is one number, the power of all tweezers"
-            raise DeviceError(self._settings.device, f"{text}; weights of sites need a camera, or an array")
+            raise DeviceError(self._settings.device, f"{text}; for weights of sites use a camera or an array")
         rows, cols = self._playing
         each_row, each_col = np.diag(rows), np.diag(cols)
         dark = self._total(0 * rows, 0 * cols)

@@ -36,7 +36,7 @@ class LoadSettings(Settings):
 
 
 class LoadStep(Step):
-    """Lets atoms load for a time, into the static tweezers at the depth that they have."""
+    """Lets atoms load for a time, into the static tweezers at their present depth."""
 
     notes = ()
 
@@ -65,7 +65,7 @@ class ImageSettings(Settings):
 
 
 class ImageStep(Step):
-    """Takes an image; the last one of a shot decides whether the shot succeeded."""
+    """Takes an image. The last image of a shot decides whether the shot succeeded."""
 
     takes_image = True
     repeatable = True
@@ -90,16 +90,16 @@ class RampSettings(Settings):
     """``ramp``: make the static tweezers shallower or deeper, without a jump."""
 
     device: Literal["static_tweezers"] = Field(
-        default="static_tweezers", description="what is ramped: so far the static tweezers alone"
+        default="static_tweezers", description="device to ramp, so far only the static tweezers"
     )
-    depth: Fraction = Field(description="depth at the end, as a fraction of the nominal one")
-    duration: PositiveDuration = Field(default=5e-3, description="how long the ramp takes; it is linear")
+    depth: Fraction = Field(description="depth at the end, as a fraction of the nominal depth")
+    duration: PositiveDuration = Field(default=5e-3, description="how long the linear ramp takes")
 
 
 class RampStep(Step):
     """Ramps the static tweezers to a depth, linearly and without a jump.
 
-    They keep it until the next ramp or the end of the shot: each shot begins at the nominal depth.
+    They keep it until the next ramp or the end of the shot. Each shot begins at the nominal depth.
     """
 
     notes = ()
@@ -108,9 +108,9 @@ class RampStep(Step):
         self.settings = settings
 
     def check_devices(self, devices: Mapping[str, object], context: StepContext) -> Mapping[str, str]:
-        """Refuse the step where the static tweezers have one depth only."""
+        """Refuse the step if the static tweezers have only one depth."""
         del devices
-        fault = "these static tweezers cannot be ramped: switch their light with a line or a device"
+        fault = "these static tweezers cannot be ramped; switch their light with a line or a device"
         return {} if context.static_tweezers.ramps else {"": fault}
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:
@@ -137,9 +137,9 @@ class ReleaseSettings(Settings):
 
 
 class ReleaseStep(Step):
-    """Turns the static tweezers off for a time that hardware keeps, then on again at the same depth.
+    """Turns the static tweezers off for a hardware-timed duration, then on again at the same depth.
 
-    Either a line of the timing box turns them off, or their driver; where neither can, the step is refused.
+    A line of the timing box turns them off, or their driver. If neither can, the step is refused.
     """
 
     notes = ()
@@ -150,13 +150,13 @@ class ReleaseStep(Step):
     def check_devices(
         self, devices: Mapping[str, object], context: StepContext
     ) -> Mapping[str, str | Problem]:
-        """Find what can release the atoms, and whether it is fast enough."""
+        """Check that the profile can release the atoms, and fast enough."""
         del devices
         by = context.release_by
         if by is None:
-            fault = "nothing on this profile can turn the static tweezers off for a time that hardware keeps"
-            hint = "wire their switch to the timing box: a line with `on: [release]` and"
-            hint += " `turns_off: static_tweezers`, see docs/how-to/release.md"
+            fault = "no device of this profile can turn the static tweezers off with hardware timing"
+            hint = "wire their switch to the timing box, as a line with `on: [release]` and"
+            hint += " `turns_off: static_tweezers` (see docs/how-to/release.md)"
             return {
                 "": Problem(fault, expected="a timing box, or tweezers whose driver can release", hint=hint)
             }
@@ -217,7 +217,7 @@ class DeviceStep(Step):
     ) -> Mapping[str, str | Problem]:
         """Have the device check the command."""
         device = devices.get(self.settings.name)
-        if isinstance(device, Device):  # not in a dry run of a profile without it
+        if isinstance(device, Device):  # None in a dry run of a profile without it
             try:
                 device.check_command(self.settings.do, **self.settings.arguments)
             except LabseqError as error:
@@ -246,11 +246,11 @@ class WaitSettings(Settings):
         default=None, alias="for", description="signal to wait for, instead of `duration`"
     )
     timeout: PositiveDuration | None = Field(
-        default=None, description="longest wait for the signal; if it does not come, the run ends"
+        default=None, description="longest wait for the signal, after which the run ends"
     )
     device: Text | None = Field(
         default=None,
-        description="device of the profile that receives the signal; needed if several could",
+        description="device of the profile that receives the signal, needed if several could",
     )
 
     @model_validator(mode="after")
@@ -261,7 +261,7 @@ class WaitSettings(Settings):
             if self.duration is None:
                 raise setting_error("a wait needs a time or a signal", "'duration', or 'for' and 'timeout'")
         elif self.duration is not None:
-            raise setting_error("'duration' excludes 'for'", "one of them", at=("duration",), key=True)
+            raise setting_error("'duration' is given with 'for'", "one of them", at=("duration",), key=True)
         elif self.timeout is None:
             raise setting_error("a wait for 'go' has no 'timeout'", "the longest wait", at=("for",), key=True)
         return self
@@ -291,7 +291,7 @@ class WaitStep(Step):
 
 
 def wait_step(settings: WaitSettings) -> Step:
-    """Waits for a time, or for the signal of an external control system."""
+    """Waits for a time, or for the signal of another control system."""
     if settings.signal is None or settings.timeout is None:
         return WaitStep(settings)
     from labseq.builtin.follow import FollowStep  # most runs follow no other system

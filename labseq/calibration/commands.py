@@ -47,18 +47,20 @@ DryRun = Annotated[
     DryRunKind | None,
     typer.Option(
         "--dry-run",
-        help="The calibrations of dry runs; they are kept apart from those of real devices.",
+        help="Use the calibrations of dry runs, which are separate from those of real devices.",
         metavar="[=fast]",
         show_choices=False,
     ),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Use it even if it is worse than the one in use.")]
+Force = Annotated[
+    bool, typer.Option("--force", help="Use it even if it is worse than the calibration in use.")
+]
 Id = Annotated[str, typer.Argument(metavar="ID", help=ID_HELP, show_default=False)]
 
 
 @calibration.command("list", short_help="List the calibrations of a profile.")
 def list_all(profile: Profile = "virtual", dry_run: DryRun = None, as_json: Json = False) -> None:
-    """List the calibrations of a profile, damaged ones included, and mark those in use."""
+    """List the calibrations of a profile, including damaged ones, and mark the ones in use."""
     from labseq.calibration.terminal import list_calibrations
 
     list_calibrations(profile, dry_run_mode(dry_run), as_json=as_json)
@@ -88,7 +90,7 @@ def use(
     dry_run: DryRun = None,
     force: Force = False,
 ) -> None:
-    """Use a calibration from the next run on; runs in progress keep theirs."""
+    """Use a calibration from the next run on. Runs in progress keep theirs."""
     from labseq.calibration.terminal import use_calibration
 
     use_calibration(choice, profile, dry_run_mode(dry_run), force=force)
@@ -102,7 +104,7 @@ def diff(
     dry_run: DryRun = None,
     as_json: Json = False,
 ) -> None:
-    """Compare two calibrations of one kind: the change of every value, and the quality."""
+    """Compare values and quality of two calibrations of one kind."""
     from labseq.calibration.terminal import compare_calibrations
 
     compare_calibrations(before, after, profile, dry_run_mode(dry_run), as_json=as_json)
@@ -124,7 +126,7 @@ def calibrate(
         typer.Option(
             "--from",
             metavar="RUN|FILE",
-            help="Analyse an earlier run instead of taking one; or read the sites of an irregular array from "
+            help="Analyse an earlier run instead of a new one, or read the sites of an irregular array from "
             "a .npy or .csv file.",
         ),
     ] = None,
@@ -133,8 +135,8 @@ def calibrate(
         typer.Option(
             "--centre",
             metavar="Y,X",
-            help="For sites: the middle of the grid on the frames, in pixels, to less than half a spacing; "
-            "needed if the frames show more traps than the grid has.",
+            help="For sites: the middle of the grid on the frames, in pixels, within half a spacing. "
+            "Needed if the frames show more traps than the grid has.",
         ),
     ] = None,
     shots: Shots = None,

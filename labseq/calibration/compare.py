@@ -1,4 +1,4 @@
-"""Compares two calibrations of the same kind; shows the age and the deciding figure of one as text."""
+"""Compares two calibrations of the same kind, and shows the deciding figure of a calibration as text."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Difference:
     Attributes:
         name: Its name.
         unit: "Hz", "m", "px", "rad", "s" or "".
-        before: The earlier figure; None for a value with many numbers.
-        after: The later figure; None for a value with many numbers.
-        greatest: Largest absolute change of any of its numbers; nan if the shapes differ.
+        before: The earlier figure. None for a value with many numbers.
+        after: The later figure. None for a value with many numbers.
+        greatest: Largest absolute change of any of its numbers. nan if the shapes differ.
         rms: Root mean square of the changes.
-        mean: Mean change of each column of the last axis where that has two, such as (y, x); else of all.
+        mean: Mean change of each column if the last axis has two, such as (y, x), else of all numbers.
     """
 
     name: str
@@ -51,7 +51,7 @@ def compare(before: CalibrationEntry, after: CalibrationEntry) -> tuple[list[Dif
         ConfigError: They are of different kinds.
     """
     if before.kind != after.kind:
-        problem = f"{before.id} is of the kind '{before.kind}', {after.id} of the kind '{after.kind}'"
+        problem = f"{before.id} is of the kind '{before.kind}', but {after.id} of the kind '{after.kind}'"
         raise ConfigError(Problem(problem, expected="two calibrations of one kind"))
     values = [
         _of_values(name, before.values[name], value)
@@ -101,7 +101,7 @@ def quantity(value: float | None, name: str) -> str:
 
 
 def quality_text(kind: CalibrationKind, quality: Mapping[str, float]) -> str:
-    """The deciding figure of a calibration as text; "-" if it has none."""
+    """The deciding figure of a calibration as text, or "-" if it has none."""
     deciding = DECIDING[kind]
     figure = quality.get(deciding.figure, math.nan)
     return "-" if math.isnan(figure) else f"{deciding.label} {quantity(figure, deciding.figure)}"

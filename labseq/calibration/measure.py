@@ -1,4 +1,4 @@
-"""Makes a calibration: measures, analyses, stores, compares, and uses it unless it is worse."""
+"""Measures, analyses, stores and compares a calibration, and uses it unless it is worse."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class CalibrationRequest:
         output: Folder for the data of the run.
         dry_run: "off", "full" or "fast".
         force: Whether to use the result even if it is worse than the calibration in use.
-        centre: "Y,X", the middle of the sites' grid on the frames, in pixels; None if no other traps are lit.
+        centre: "Y,X", middle of the grid of sites on the frames, in pixels. None if no other traps are lit.
     """
 
     profile: str
@@ -88,12 +88,12 @@ class Outcome:
     """The result of a calibration.
 
     Attributes:
-        stored: The entry, stored whether it is in use or not.
+        stored: The entry, which is stored even if it is not in use.
         summary_lines: Lines that summarise the result for the user.
-        before: The entry that was in use; None if there was none that can be compared.
+        before: The entry that was in use. None if there was no comparable entry.
         changes: Change of each value from that entry.
-        run: The run that was analysed; None for a file.
-        refused: Why the result is not in use; "" if it is.
+        run: The run that was analysed. None for a file.
+        refused: Why the result is not in use. "" if it is.
         warnings: Warnings for the user.
     """
 
@@ -107,7 +107,7 @@ class Outcome:
 
 
 def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver | None = None) -> Outcome:
-    """Measure, analyse and store a calibration, and use it unless it is worse than the one in use.
+    """Measure, analyse and store a calibration, and use it unless it is worse than the previous one.
 
     Args:
         method: One of :data:`METHODS`.
@@ -120,7 +120,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
             in use stays in use.
         LabseqError: Another error ended the run.
     """
-    _centre(method, request)  # a mistake in it is reported before the run is taken
+    _centre(method, request)  # reports a mistake before the run is taken
     document, spec = load_profile(request.profile, overrides=_of_profile(request.overrides))
     ignoring = _ignoring(store_of(document, spec).folder, spec, method)
     hardware = resolve_profile(request.profile, _of_profile([*request.overrides, ignoring]), request.dry_run)
@@ -131,7 +131,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
         quality=result.quality,
         grid=grid_facts(hardware.grid),
         origin={**_origin(method, request, hardware, run), **result.origin},
-        # the time of the measurement, as an old run may be analysed again
+        # the time of the measurement, because an old run may be analysed again
         taken_utc=now_utc() if run is None else str(run.record["t_start_utc"]),
     )
     store = store_of(document, spec, request.dry_run)
@@ -143,7 +143,7 @@ def calibrate(method: Method, request: CalibrationRequest, observer: RunObserver
         store.use(stored, hardware.grid)
         overlay = store.active().get("overlay")
         if entry.kind == "frequencies" and overlay is not None:
-            store.use_none("overlay")  # or its correction would be made twice
+            store.use_none("overlay")  # otherwise its correction would be made twice
             warnings += (f"overlay {overlay.id} is no longer used: these frequencies include its correction",)
     if pin := spec.calibrations.use.of(method.kind):
         text = f"the profile says 'calibrations.use.{method.kind}: {clean(pin)}', which takes precedence"
@@ -176,7 +176,7 @@ def _analysed(
     except LabseqError:
         if observer is not None:
             again = f"analyse the run again with --from {run.path}"
-            text = f"the calibration failed, and the one in use is unchanged; {again}"
+            text = f"the calibration failed, and the calibration in use is unchanged; {again}"
             observer.event("warning", {"text": text})
         raise
 
@@ -191,7 +191,7 @@ def _measure(
     grid = hardware.grid
     fitting = [*_meter(method, hardware.profile), *_target(method, grid), *_repeats(method, grid)]
     overrides = [*fitting, *request.overrides, ignoring]
-    if not method.uses_detector:  # its settings may be wrong before it is calibrated
+    if not method.uses_detector:  # the detector's settings may be wrong before it is calibrated
         overrides = [text for text in overrides if not text.lstrip().startswith("profile.detector.")]
         overrides.append("profile.detector={use: blind}")
     with Session.open(
@@ -208,7 +208,7 @@ def _measure(
 
 
 def _open(source: Path, request: CalibrationRequest, hardware: ResolvedProfile) -> Run:
-    """Open a run of the profile's sites and devices.
+    """Open a run with the profile's sites and devices.
 
     Raises:
         ConfigError: It is not a run, or has other sites or devices.
@@ -228,9 +228,9 @@ def _open(source: Path, request: CalibrationRequest, hardware: ResolvedProfile) 
     if run.simulated != (request.dry_run != "off" or hardware.virtual_time):
         problem = f"the run was {'simulated' if run.simulated else 'taken with real devices'}"
         expected = (
-            f"one {'with real devices' if run.simulated else 'that was simulated'}, as the profile's are"
+            f"a {'run with real devices' if run.simulated else 'simulated run'}, like the profile's devices"
         )
-        hint = "calibrations of dry runs are made with --dry-run" if run.simulated else ""
+        hint = "use --dry-run for calibrations of dry runs" if run.simulated else ""
         raise ConfigError(Problem(problem, str(source), expected=expected, hint=hint))
     return run
 
@@ -240,20 +240,20 @@ def _centre(method: Method, request: CalibrationRequest) -> tuple[float, float] 
         return None
     if method.kind != "sites":
         raise ConfigError(
-            Problem(f"a calibration of {method.kind} has no centre", "--centre", expected="sites")
+            Problem(f"a calibration of {method.kind} takes no --centre", "--centre", expected="sites")
         )
     try:
         y, x = (float(part) for part in request.centre.split(","))
     except ValueError:
         y = x = math.nan
     if not math.isfinite(y + x):
-        expected = "Y,X: two numbers of pixels, such as 250,261.5"
+        expected = "two numbers of pixels Y,X such as 250,261.5"
         raise ConfigError(Problem(f"'{clean(request.centre)}'", "--centre", expected=expected))
     return y, x
 
 
 def _ignoring(folder: Path, spec: ProfileSpec, method: Method) -> str:
-    """The override that makes runs ignore the method's own kinds, which may be damaged."""
+    """The override that makes runs ignore calibrations of the method's own kinds, which may be damaged."""
     use = {
         kind: OFF if kind in method.ignored else pin
         for kind in CALIBRATION_KINDS
@@ -264,7 +264,7 @@ def _ignoring(folder: Path, spec: ProfileSpec, method: Method) -> str:
 
 
 def _meter(method: Method, spec: ProfileSpec) -> list[str]:
-    """The overrides that make the step `equalise` measure as the profile's `equalise` says."""
+    """The overrides that make the step `equalise` use the meter of the profile's `equalise`."""
     if method.kind not in ("tweezers", "amplitudes"):
         return []
     meter = spec.equalise
@@ -274,11 +274,11 @@ def _meter(method: Method, spec: ProfileSpec) -> list[str]:
 
 
 def _target(method: Method, grid: SiteGrid) -> list[str]:
-    """The overrides for a target as large as a reservoir allows, and without the time that is measured."""
+    """The overrides for a target as large as the reservoir allows, and without the measured time."""
     if method.kind != "timing":
         return []
     if grid.shape == (1, 1):
-        problem = "the grid has a single site, so that no atom can be moved"
+        problem = "the grid has a single site, so no atom can be moved"
         raise ConfigError(
             Problem(problem, "labseq calibrate timing", expected="a grid of at least two sites")
         )
@@ -290,7 +290,7 @@ def _target(method: Method, grid: SiteGrid) -> list[str]:
 
 def _repeats(method: Method, grid: SiteGrid) -> list[str]:
     """The override for more repeats on a small grid, so that enough atoms are probed."""
-    # with so many sites at each point, of which 75 % are loaded, the centre is known to about 35 nm
+    # with these numbers of sites at each point, 75 % loaded, the centre is known to about 35 nm
     n_sites = {"overlay": 50, "frequencies": 100}.get(method.kind, 0)
     n_repeats = math.ceil(n_sites / (grid.n_rows * grid.n_cols))
     return [f"repeats={n_repeats}"] if n_repeats > 4 else []  # their sequences have up to 4
@@ -316,7 +316,7 @@ def _origin(
 
 
 def _in_use(store: Store, entry: CalibrationEntry) -> CalibrationEntry | None:
-    """The entry that the new one would replace, if the two can be compared."""
+    """The entry that the new entry would replace, if the two can be compared."""
     try:
         stored = store.entry_in_use(entry.kind)
     except ConfigError:
@@ -325,9 +325,9 @@ def _in_use(store: Store, entry: CalibrationEntry) -> CalibrationEntry | None:
 
 
 def _picture(result: AnalysisResult) -> tuple[bytes | None, tuple[str, ...]]:
-    """The picture as PNG; a warning instead if it cannot be drawn."""
+    """The picture as PNG, or a warning if it cannot be drawn."""
     if result.draw is None:
         return None, ()
     if not can_draw():
-        return None, (f"there is no picture: matplotlib is not installed ({install_hint('plot')})",)
+        return None, (f"there is no picture because matplotlib is not installed ({install_hint('plot')})",)
     return encode_figure(result.draw, dpi=110), ()

@@ -34,11 +34,11 @@ class AnalysisResult:
     """The result of analysing a run or a file.
 
     Attributes:
-        values: The calibrated values; see :class:`labseq.CalibrationEntry`.
+        values: The calibrated values (see :class:`labseq.CalibrationEntry`).
         quality: Figures of merit.
         summary_lines: Lines that summarise the result for the user.
         origin: Additions to the entry's ``origin``, JSON-ready.
-        draw: Draws a picture of the result; None if there is none.
+        draw: Draws a picture of the result. None if there is none.
     """
 
     values: Mapping[str, ArrayLike]
@@ -63,11 +63,11 @@ class CalibrationData:
     centre_px: tuple[float, float] | None = None
 
     def frames(self) -> Iterator[Frame]:
-        """The first frame of each shot: randomly loaded atoms, before any move.
+        """The first frame of each shot, with randomly loaded atoms before any move.
 
         Raises:
-            ConfigError: The run has no shots, or kept no frames of them.
-            DeviceError: The frames differ in size, or one is saturated.
+            ConfigError: The run has no shots, or kept no frames.
+            DeviceError: The frames differ in size, or a frame is saturated.
             RecordingError: A shot's file is damaged.
         """
         path = str(self.run.path)
@@ -83,9 +83,9 @@ class CalibrationData:
             shape = shape or frame.image.shape
             if frame.image.shape != shape:
                 sizes = f"{shape} and {frame.image.shape}"
-                raise DeviceError(frame.camera, f"frames of the run differ in size: {sizes}")
+                raise DeviceError(frame.camera, f"frames of the run have different sizes, {sizes}")
             n_saturated = int(np.count_nonzero(frame.image == np.iinfo(frame.image.dtype).max))
-            # 20 in any frame may be hot pixels and cosmic rays
+            # any frame may have 20 hot pixels and cosmic rays
             if n_saturated > max(20, self.hardware.grid.n_rows * self.hardware.grid.n_cols // 20):
                 problem = f"{n_saturated} pixels of the first frame of shot {shot.index} are saturated"
                 raise DeviceError(frame.camera, f"{problem}; use less light, gain or exposure")
@@ -101,13 +101,13 @@ class CalibrationData:
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """How one kind of calibration is made: its sequence and its analysis.
+    """The sequence and analysis of one kind of calibration.
 
     Attributes:
         kind: The kind.
-        analyse: Makes a calibration from a run; raises a ``LabseqError`` that says why if it cannot.
-        read: Makes a calibration from a file of values; None if this kind needs a run.
-        ignored: Kinds of calibration that are used neither in the run nor in the analysis.
+        analyse: Makes a calibration from a run, or raises a ``LabseqError`` that says why it cannot.
+        read: Makes a calibration from a file of values. None if this kind needs a run.
+        ignored: Kinds of calibration that neither the run nor the analysis uses.
         uses_detector: Whether the run detects atoms. The others run before the detector is calibrated.
     """
 
@@ -119,7 +119,7 @@ class Method:
 
     @property
     def sequence(self) -> Path:
-        """Name of the sequence to run, which comes with labseq."""
+        """Name of the packaged sequence to run."""
         return Path(__file__).with_name(f"{self.kind}.yaml")
 
 
@@ -129,12 +129,12 @@ class ProbeCounts:
 
     Attributes:
         offset_m: float64 (n_points, 2), commanded offsets along a1 and a2.
-        n_before: int64 (n_points, n_rows, n_cols), atoms that were probed on each site.
-        n_survived: int64, of the same shape: number of these atoms seen afterwards.
+        n_before: int64 (n_points, n_rows, n_cols), number of probed atoms on each site.
+        n_survived: int64, of the same shape, number of these atoms seen afterwards.
         grid: The grid, with the tones that were played.
         motion: How the tweezers moved.
         in_use_m: float64 (2,), the offset that the overlay calibration of the run corrected.
-        calibrations: The calibrations in use in the run: kind -> id.
+        calibrations: Kind -> id of the calibration in use in the run.
     """
 
     offset_m: NDArray[np.float64]
@@ -159,11 +159,11 @@ def count_probed(run: Run) -> ProbeCounts:
         offset, occupancies = next(values, None), shot.occupancies
         if offset is None or len(occupancies) < 2:
             problem = "the run does not scan the offset of a probe between two images"
-            expected = "one such as 'labseq calibrate overlay' takes"
+            expected = "a run as from 'labseq calibrate overlay'"
             raise ConfigError(Problem(problem, str(run.path), expected=expected))
         point = float(offset[0]), float(offset[1])
         before, after = occupancies[0], occupancies[-1]
-        # an atom that comes to an empty site meanwhile is not a survivor
+        # an atom that comes to an empty site in between is not a survivor
         counts[point] = counts.get(point, 0) + np.stack([before, before & after]).astype(np.int64)
     if not counts:
         expected = "a scan of a probe's offset"

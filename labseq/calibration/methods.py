@@ -37,7 +37,7 @@ Floats = NDArray[np.float64]
 ROUNDS: Final = 30
 """Maximum number of rounds of the fit of rows and columns."""
 KNOWN_BEFORE_M: Final = 0.5e-6
-"""Expected distance of a row or column from the common centre, 1 sigma, before the measurement."""
+"""Prior distance of a row or column from the common centre, 1 sigma."""
 WORST_ERROR_M: Final = 50e-9
 SLOPE_STEP_M: Final = 1e-9
 
@@ -46,10 +46,10 @@ def analyse_sites(data: CalibrationData) -> AnalysisResult:
     """Find the lattice on the mean of the run's frames.
 
     Raises:
-        DeviceError: No lattice was found; says why.
+        DeviceError: No lattice was found. The message says why.
         ConfigError: The run has no frames.
     """
-    # added up one by one, so that only one frame is in memory
+    # added one by one, so that only one frame is in memory
     total, n_frames = np.zeros(1), 0
     for frame in data.frames():
         total, n_frames = total + frame.image, n_frames + 1
@@ -83,7 +83,7 @@ def read_site_file(path: Path, hardware: ResolvedProfile) -> AnalysisResult:
     settings: Any = hardware.chosen["detector"].settings
     frame = getattr(settings, "frame", None)
     if frame is None:
-        problem = "the detector does not say how large the frames are that the sites are on"
+        problem = "the detector does not know the size of the frames with the sites"
         raise ConfigError(Problem(problem, expected="a detector with the setting 'frame'"))
     positions = read_sites(path, hardware.grid.shape)
     if np.any((positions < 0) | (positions > np.array(frame) - 1)):
@@ -105,12 +105,12 @@ def _summary_lines(lattice: FoundLattice, n_frames: int) -> tuple[str, ...]:
         format_quantity(lattice.pixel_size_m, "length"),
     )
     form = f", stretched by {100 * (lattice.stretch - 1):.1f} %" if np.isfinite(lattice.stretch) else ""
-    size = f"a pixel is {pixel} wide if the grid's spacing is true"
+    size = f"a pixel is {pixel} wide if the grid's spacing is right"
     return first, f"spacing {spacings}; rotated by {angle}{form}; {size}"
 
 
 def analyse_tweezers(data: CalibrationData) -> AnalysisResult:
-    """Read the amplitudes or weights that the step ``equalise`` found in the run's last shot.
+    """Read the amplitudes or weights from the step ``equalise`` in the run's last shot.
 
     Raises:
         ConfigError: No shot of the run equalised the tweezers of this grid.
@@ -118,8 +118,8 @@ def analyse_tweezers(data: CalibrationData) -> AnalysisResult:
     readings = _readings(data.run)
     before, after = (np.array(readings[name], np.float64) for name in ("power_before", "power_after"))
     if before.shape != data.hardware.grid.shape:
-        raise _wrong_run(data.run, f"it equalised {len(before)} x {len(before[0])} tweezers")
-    # the amplitudes of tweezers without tones are equal, so that every driver can read the calibration
+        raise _wrong_run(data.run, f"this run equalised {len(before)} x {len(before[0])} tweezers")
+    # tweezers without tones get equal amplitudes, so that every driver can read the calibration
     equal = [[1 / n] * n for n in before.shape]
     rows, cols = (
         np.array(readings.get(name, value), np.float64)
@@ -147,7 +147,7 @@ def analyse_tweezers(data: CalibrationData) -> AnalysisResult:
         quality,
         (
             f"{work}: rows and columns are equal to {spread}",
-            f"left from site to site, which the tones cannot change: {quality['residual_spread']:.1%}",
+            f"a spread of {quality['residual_spread']:.1%} remains, which the tones cannot change",
         ),
         draw=lambda: draw_powers(before, after, rows, cols),
     )
@@ -156,8 +156,8 @@ def analyse_tweezers(data: CalibrationData) -> AnalysisResult:
 def analyse_timing(data: CalibrationData) -> AnalysisResult:
     """Find the time from the start of a rearrangement cycle until its light is on.
 
-    The stage ``light`` of a shot counts from the frame, and so includes the detection. The clock of a
-    simulated run stands still while the computer works; there the computer's time is added.
+    The stage ``light`` of a shot starts at the frame and so includes the detection. The clock of a simulated
+    run stops while the computer works, so the computer's time is added.
 
     Raises:
         ConfigError: No shot of the run moved atoms.
@@ -172,7 +172,7 @@ def analyse_timing(data: CalibrationData) -> AnalysisResult:
                 host_s = stage.host_s - detect.host_s if data.run.simulated else 0.0
                 taken_s.append(stage.duration_s - detect.duration_s + host_s)
     if not taken_s:
-        problem = "no shot of it moved atoms; choose a target that random loadings do not meet"
+        problem = "no shot of this run moved atoms; choose a target that random loadings do not meet"
         raise ConfigError(Problem(problem, str(data.run.path), expected="a run that rearranges"))
     median_s, p99_s = (float(value) for value in np.quantile(taken_s, (0.5, 0.99)))
     median, p99 = (format_quantity(value, "time") for value in (median_s, p99_s))
@@ -193,7 +193,7 @@ def _readings(run: Run) -> dict[str, Any]:
         }
         if readings:
             return readings
-    raise _wrong_run(run, "no shot of it equalised the tweezers")
+    raise _wrong_run(run, "no shot of this run equalised the tweezers")
 
 
 def _wrong_run(run: Run, problem: str) -> ConfigError:
@@ -208,7 +208,7 @@ class FrequenciesFit:
 
     Attributes:
         row_hz: float64 (n_rows,), frequency of each row's tone.
-        column_hz: float64 (n_cols,), of each column's.
+        column_hz: float64 (n_cols,), frequency of each column's tone.
         row_offset_m: float64 (n_rows,), distance of each row's tweezers from their sites, along a2.
         column_offset_m: float64 (n_cols,), the same for the columns, along a1.
         row_error_m: float64 (n_rows,), standard errors.
@@ -240,17 +240,16 @@ def fit_frequencies(
 ) -> FrequenciesFit:
     """Find the position of each row's and column's tweezers, and the tones that centre them on the sites.
 
-    All sites have the same survival peak (:func:`fit_overlay`). Its centre on the
-    site (i, j) is that of column j along a1 and of row i along a2; all are fitted together by maximum
-    likelihood. Each is then shrunk towards a parabola through the others of its axis, as much as
-    its error and the scatter of all about the parabola require: one with few atoms takes the value
-    of its neighbours. The tones include the common shift, so that the overlay that was corrected
-    in the measurement is no longer needed.
+    All sites have the same survival peak (:func:`fit_overlay`). Its centre on the site (i, j) is the centre
+    of column j along a1 and of row i along a2. All centres are fitted together by maximum likelihood. Each
+    centre is then shrunk towards a parabola through the others of its axis, as much as its error and the
+    scatter about the parabola require. A row or column with few atoms takes the value of its neighbours. The
+    tones include the common shift, so the overlay from the measurement is no longer needed.
 
     Args:
         offset_m: float64 (n_points, 2), commanded offsets along a1 and a2.
-        n_before: int (n_points, n_rows, n_cols), atoms that were probed on each site.
-        n_survived: int, of the same shape: how many of them were seen afterwards.
+        n_before: int (n_points, n_rows, n_cols), number of probed atoms on each site.
+        n_survived: int, of the same shape, number of these atoms seen afterwards.
         grid: The grid of sites, with the tones that were played.
         motion: How the tweezers move.
         worst_error_m: Maximum allowed r.m.s. error of rows and columns, in metres.
@@ -261,7 +260,9 @@ def fit_frequencies(
     """
     offset, n, k = checked_counts(offset_m, n_before, n_survived)
     if n.shape[1:] != grid.shape:
-        raise ValueError(f"counts of shape {n.shape}; expected (n_points, {grid.n_rows}, {grid.n_cols})")
+        raise ValueError(
+            f"the counts have shape {n.shape}; expected (n_points, {grid.n_rows}, {grid.n_cols})"
+        )
     overlay = fit_overlay(offset, n, k, grid)
     # beyond the reach no atom survives, wherever the centre is
     near = distance_m(offset - overlay.centre_m, unit_axes(grid)) < overlay.shape.reach_m
@@ -277,7 +278,7 @@ def fit_frequencies(
     if fit.error_m > worst_error_m:
         reached, required = (format_quantity(m, "length") for m in (fit.error_m, worst_error_m))
         factor = math.ceil((fit.error_m / worst_error_m) ** 2)
-        problem = f"no frequencies found: too few atoms: rows and columns are only known to {reached}"
+        problem = f"no frequencies found, as with too few atoms rows and columns are only known to {reached}"
         remedy = f"for {required} take {factor} times as many `repeats`"
         raise DeviceError("mobile_tweezers", f"{problem}; {remedy}")
     return fit
@@ -288,8 +289,8 @@ def smoothed(values: Floats, errors: Floats) -> tuple[Floats, Floats]:
 
     The scatter about the parabola in excess of the errors is chosen so that chi squared equals its degrees of
     freedom (Paule and Mandel, J. Res. Natl. Bur. Stand. 87, 377, 1982). Each value becomes the mean of itself
-    and the parabola, weighted by the inverse of its error and of that scatter, squared. One that is
-    further than three times both from the parabola is not changed.
+    and the parabola, weighted by the inverse squares of its error and of that scatter. A value more than
+    three times both away from the parabola is not changed.
 
     Args:
         values: float64 (n,), in the order of rows or columns.
@@ -307,7 +308,7 @@ def smoothed(values: Floats, errors: Floats) -> tuple[Floats, Floats]:
     n = len(values)
     degree = 2 if n >= 6 else 1 if n >= 3 else 0
     basis = np.vander(np.linspace(-1, 1, n), degree + 1)
-    # bisection: chi squared falls as the scatter rises
+    # bisection, because chi squared falls as the scatter rises
     low, high = 0.0, float(np.ptp(values)) + 1e-30
     for _ in range(60):
         middle = (low + high) / 2
@@ -352,7 +353,7 @@ def _centres(
         centres += np.clip(step, -overlay.shape.edge_m, overlay.shape.edge_m)
         if np.abs(step).max() < 0.1e-9:
             break
-    # the excess scatter is that of single sites, over which a row or column averages
+    # a row or column averages over the excess scatter of single sites
     excess = 1 + (overlay.dispersion - 1) / min(grid.shape)
     return centres[:n_cols], centres[n_cols:], spread * excess
 
@@ -372,10 +373,10 @@ def _slopes(offset: Floats, shape: SurvivalShape, grid: SiteGrid) -> tuple[Float
 def analyse_frequencies(data: CalibrationData) -> AnalysisResult:
     """Find the tones that centre the tweezers of each row and column on the sites.
 
-    They include the correction of the active overlay calibration.
+    The tones include the correction of the active overlay calibration.
 
     Raises:
-        DeviceError: There are too few atoms, or no offset at which most survive; says why.
+        DeviceError: There are too few atoms, or no offset at which most survive. The message says why.
         ConfigError: The run is not a scan of a probe's offset.
     """
     probed = count_probed(data.run)
@@ -403,7 +404,7 @@ def analyse_overlay(data: CalibrationData) -> AnalysisResult:
     """Find the offset at which most atoms survive.
 
     Raises:
-        DeviceError: There is no such offset; says why, and where to look.
+        DeviceError: There is no such offset. The message says why, and where to look.
         ConfigError: The run is not a scan of a probe's offset.
     """
     probed = count_probed(data.run)
@@ -430,4 +431,4 @@ def offset_text(fit: OverlayFit, probed: ProbeCounts) -> str:
     along, across = (format_quantity(float(-centre), "length") for centre in fit.centre_m)
     use = ", in addition to the correction in use" if np.any(probed.in_use_m) else ""
     where = f"from the sites by {along} along rows and {across} from row to row{use}"
-    return f"{fit.n_atoms} atoms: the mobile tweezers were offset {where}"
+    return f"{fit.n_atoms} atoms show that the mobile tweezers were offset {where}"

@@ -28,7 +28,7 @@ def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figu
     Args:
         mean: float64 (height, width), the averaged frame, in counts.
         positions_px: float64 (n_rows, n_cols, 2), (y, x) of each site in pixels.
-        residuals_px: float64 (n_rows, n_cols, 2), (y, x) of each spot minus its site; NaN if not found.
+        residuals_px: float64 (n_rows, n_cols, 2), (y, x) of each spot minus its site. NaN if not found.
     """
     spacing = _spacing_px(positions_px)
     y, x = positions_px.reshape(-1, 2).T
@@ -61,7 +61,7 @@ def draw_sites(mean: Floats, positions_px: Floats, residuals_px: Floats) -> Figu
 
 
 def _draw_arrows(axes: Axes, x: Floats, y: Floats, off_px: Floats, spacing_px: float) -> float:
-    """Draw the distances of spots from their sites, enlarged; return the longest, in pixels."""
+    """Draw the enlarged distances of spots from their sites, and return the longest, in pixels."""
     longest = float(np.hypot(*off_px.T).max(initial=0.0))
     if longest > 0:
         # the longest is as long as half a spacing
@@ -89,7 +89,7 @@ def draw_thresholds(signals: Floats, thresholds: Floats, unit: str) -> Figure:
     by_site = signals.reshape(len(signals), -1).T
     counts = np.stack([np.histogram(site_signals, edges)[0] for site_signals in by_site], axis=1)
     extent = (-0.5, len(by_site) - 0.5, low, high)
-    # logarithmic, as the few signals between the peaks matter
+    # logarithmic, because the few signals between the peaks matter
     below.imshow(np.log1p(counts), cmap="gray_r", aspect="auto", origin="lower", extent=extent)
     site = np.arange(len(by_site))
     below.step(site, thresholds.ravel(), where="mid", color=ARROW, linewidth=0.8, label="threshold")
@@ -100,7 +100,7 @@ def draw_thresholds(signals: Floats, thresholds: Floats, unit: str) -> Figure:
 
 
 def _spacing_px(positions_px: Floats) -> float:
-    """Smallest distance of neighbours along rows and columns, in pixels; a guess for a single site."""
+    """Smallest distance of neighbours along rows and columns, in pixels. A guess for a single site."""
     steps = [np.diff(positions_px, axis=axis).reshape(-1, 2) for axis in (0, 1)]
     lengths = np.hypot(*np.concatenate(steps).T)
     return float(np.median(lengths)) if len(lengths) else 10.0
@@ -120,17 +120,17 @@ def draw_survival(
 
     Args:
         offset_m: float64 (n_points, 2), commanded offsets along a1 and a2.
-        n_before: int64 (n_points,), atoms that were probed.
-        n_survived: int64 (n_points,), number of them that survived.
-        survival: The fitted function: offsets (n, 2) -> probabilities (n,).
+        n_before: int64 (n_points,), number of probed atoms.
+        n_survived: int64 (n_points,), number of surviving atoms.
+        survival: The fitted function from offsets (n, 2) to probabilities (n,).
     """
     figure = make_figure(8.0, 4.0, layout="constrained")
     middle = np.median(offset_m, axis=0)
     for axis, axes in enumerate(figure.subplots(1, 2, sharey=True)):
-        # the scan is a cross: only the points of its arm along this axis, apart from rounding
+        # the scan is a cross, so take only the points of its arm along this axis, within rounding
         on_line = np.abs(offset_m[:, 1 - axis] - middle[1 - axis]) < 1e-9
         x_m, n, k = offset_m[on_line, axis], np.maximum(n_before[on_line], 1), n_survived[on_line]
-        # half an atom is added to both counts: the error is not 0 where all survive
+        # half an atom is added to both counts, so that the error is not 0 if all survive
         error = np.sqrt((k + 0.5) * (n - k + 0.5) / (n + 1)) / (n + 1)
         axes.errorbar(1e6 * x_m, k / n, error, fmt="o", color=POINT, markersize=4, label="atoms")
         line_m = np.repeat(middle[None], 200, axis=0)
@@ -167,11 +167,11 @@ def draw_powers(
     """Draw maps of the powers, relative to their means, and the resulting amplitudes.
 
     Args:
-        before: float64 (n_rows, n_cols), powers at the start; nan if unknown.
+        before: float64 (n_rows, n_cols), powers at the start. nan if unknown.
         after: float64 (n_rows, n_cols), powers at the end.
         rows: float64 (n_rows,), amplitudes of the rows' tones, fractions of full scale.
         cols: float64 (n_cols,), amplitudes of the columns' tones.
-        label: What the bars of rows and columns show; mean weights for tweezers without tones.
+        label: Label of the bars of rows and columns. For tweezers without tones they show mean weights.
     """
     figure = make_figure(*SIZE_IN, layout="constrained")
     panels = figure.subplots(2, 2, height_ratios=(2.2, 1.0))

@@ -1,4 +1,4 @@
-"""`labseq calibrate` and `labseq calibration`: do the work and print the result."""
+"""Does the work of `labseq calibrate` and `labseq calibration`, and prints the results."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from labseq.messages import clean, did_you_mean, listing
 from labseq.model import CALIBRATION_KINDS, CalibrationKind
 
 MAX_LISTED: Final = 4
-"""Maximum number of numbers that are printed of a value; for more, lowest, highest and mean are printed."""
+"""Maximum number of printed numbers of a value. For more, lowest, highest and mean are printed."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationRow:
-    """A calibration; of a damaged file only its kind, its id and the error are known."""
+    """A calibration. For a damaged file only its kind, its id and the error are known."""
 
     kind: str
     id: str
@@ -51,7 +51,7 @@ class CalibrationRow:
 
     @classmethod
     def of(cls, calibration: Stored | Damaged, files_in_use: Mapping[str, str]) -> CalibrationRow:
-        """An entry of a store; ``files_in_use`` as :func:`in_use` returns it."""
+        """An entry of a store. ``files_in_use`` is from :func:`in_use`."""
         path = calibration.path
         if isinstance(calibration, Damaged):
             is_used = files_in_use.get(calibration.kind) == path.name
@@ -92,7 +92,7 @@ class CalibrationList:
     """The calibrations of a profile, oldest first.
 
     Attributes:
-        problems: Why it is unknown which are in use.
+        problems: Why it is unknown which calibrations are in use.
     """
 
     folder: Path
@@ -100,7 +100,7 @@ class CalibrationList:
     problems: Sequence[str]
 
     def as_text(self) -> list[str]:
-        """A row per calibration, and what is damaged."""
+        """A row per calibration, and the damaged files."""
         if not self.calibrations:
             return [f"there are no calibrations in {self.folder}", *_below(self.problems)]
         problems = [*self.problems, *(row.error for row in self.calibrations if row.error)]
@@ -108,7 +108,7 @@ class CalibrationList:
 
 
 def _below(lines: Sequence[str]) -> list[str]:
-    """Lines below an empty one; nothing if there are none."""
+    """Lines below an empty line, or nothing."""
     return ["", *lines] if lines else []
 
 
@@ -135,7 +135,7 @@ class CalibrationDetails(CalibrationRow):
     values: Mapping[str, NDArray[np.float64]] = field(default_factory=dict[str, Any])
 
     def as_text(self) -> list[str]:
-        """A line per figure and value; values of many numbers are summed up."""
+        """A line per figure and value. Values of many numbers are summarised."""
         return aligned(
             [
                 ("calibration", f"{self.kind} {self.id}"),
@@ -192,7 +192,7 @@ def compare_calibrations(before: str, after: str, profile: str, dry_run: DryRun,
     """Print the changes from one calibration to another.
 
     Raises:
-        ConfigError: They are of different kinds, or one cannot be read.
+        ConfigError: They are of different kinds, or cannot be read.
     """
     store, _ = open_store(profile, dry_run)
     earlier, later = store.find(before).entry, store.find(after).entry
@@ -206,8 +206,8 @@ class Change:
     """The changes from one calibration to another.
 
     Attributes:
-        before: Id of the earlier one.
-        after: Id of the later one.
+        before: Id of the earlier calibration.
+        after: Id of the later calibration.
         ends: Both with their times.
         values: The changes of their values.
         quality: The changes of their figures of merit.
@@ -221,7 +221,7 @@ class Change:
     quality: Sequence[Difference]
 
     def as_text(self) -> list[str]:
-        """A table of the values, and one of the figures of merit."""
+        """A table of the values, and a table of the figures of merit."""
         figures = _below(table(self.quality, FIGURES) if self.quality else [])
         return [f"{self.kind}: {self.ends}", "", *table(self.values, DIFFERENCES), *figures]
 
@@ -279,15 +279,15 @@ def _origin_text(value: Any) -> str:
 def _time_text(taken_utc: str | None) -> str:
     if taken_utc is None:
         return "-"
-    return f"{datetime.fromisoformat(taken_utc).astimezone(UTC):%Y-%m-%d\xa0%H:%M}\xa0UTC"  # in one piece
+    return f"{datetime.fromisoformat(taken_utc).astimezone(UTC):%Y-%m-%d\xa0%H:%M}\xa0UTC"  # never broken over two lines
 
 
 def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> None:
     """Make a calibration, store it, and use it unless it is worse.
 
     Raises:
-        ConfigError: The request has an error; or the calibration is worse than the one in use, and was
-            only stored.
+        ConfigError: The request has an error, or the calibration is worse than the one in use and was only
+            stored.
         LabseqError: The calibration failed.
     """
 
@@ -315,10 +315,10 @@ class Calibrated:
     """A calibration that was made.
 
     Attributes:
-        refused: Why it is not in use; None if it is.
-        summary: What was measured.
+        refused: Why it is not in use. None if it is.
+        summary: Lines about the measurement.
         before: Id of the calibration that was in use.
-        changes: The changes from that one.
+        changes: The changes from that calibration.
     """
 
     kind: str
@@ -369,7 +369,7 @@ class Calibrated:
 
 
 class _Progress(LogLines):
-    """Implements ``RunObserver`` with a line for every tenth of the shots, and one for each lasting event."""
+    """Implements ``RunObserver`` with a line for every tenth of the shots, and for each lasting event."""
 
     def __init__(self) -> None:
         super().__init__(sys.stderr, LASTING)

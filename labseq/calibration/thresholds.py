@@ -18,7 +18,7 @@ Bools = NDArray[np.bool_]
 
 N_BINS: Final = 1000
 OUTER: Final = 0.5
-"""Signals further than this on the outer side of a peak are only counted; in widths of the peak."""
+"""Signals beyond this distance on the outer side of a peak are only counted. In widths of the peak."""
 FLATTEST: Final = 1e-5
 """Skewness below which a peak is treated as a Gaussian."""
 MIN_FRAMES: Final = 30
@@ -26,11 +26,11 @@ MIN_FRAMES: Final = 30
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """Pearson type III distribution: a shifted and scaled gamma distribution, mirrored for negative skewness.
+    """Pearson type III distribution, a shifted and scaled gamma distribution, mirrored for negative skewness.
 
-    The counts of k photoelectrons after an EM register follow a gamma distribution, and those
-    of a Poisson number of them have its skewness and, within an eighth, its excess kurtosis.
-    ``scipy.stats.pearson3`` is ten times slower and less exact where the skewness is small.
+    The counts of k photoelectrons after an EM register follow a gamma distribution. For a Poisson number of
+    photoelectrons, the counts have its skewness and, within an eighth, its excess kurtosis.
+    ``scipy.stats.pearson3`` is ten times slower and less exact for small skewness.
 
     Attributes:
         mean: Mean.
@@ -43,7 +43,7 @@ class Peak:
     skewness: float
 
     def log_density(self, at: Floats) -> Floats:
-        """Logarithm of the density; -700 where the density is 0."""
+        """Logarithm of the density, or -700 where the density is 0."""
         from scipy.special import gammaln
 
         z = (at - self.mean) / self.width
@@ -55,7 +55,7 @@ class Peak:
         inside = np.maximum(part, -1 + 1e-12)
         norm = (order - 0.5) * np.log(order) - order - gammaln(order)
         if order > 1e4:
-            norm = -0.5 * np.log(2 * np.pi) - 1 / (12 * order)  # Stirling: the line above cancels
+            norm = -0.5 * np.log(2 * np.pi) - 1 / (12 * order)  # Stirling, because the line above cancels
         log_p = order * (np.log1p(inside) - inside) - np.log1p(inside) + norm - np.log(self.width)
         return np.where(part > -1, np.maximum(log_p, -700.0), -700.0)
 
@@ -86,7 +86,7 @@ class Shapes:
     Attributes:
         empty: The lower peak.
         full: The upper peak.
-        between: Fraction of the signals spread evenly between the peaks: atoms lost during the exposure.
+        between: Fraction of signals spread evenly between the peaks, from atoms lost during the exposure.
     """
 
     empty: Peak
@@ -97,15 +97,15 @@ class Shapes:
 def fit_shapes(signals: Floats, loading: float, width_empty: float, width_full: float) -> Shapes:
     """Fit two peaks and a constant between them by maximum likelihood.
 
-    Atoms lost during the exposure fluoresce for a part of it. The constant describes them;
-    without it they would lengthen the tails of the peaks. On the outer side of each
-    peak signals are only counted, because the errors depend on the inner sides.
+    Atoms lost during the exposure fluoresce for a part of it. The constant describes them, because otherwise
+    they would lengthen the tails of the peaks. On the outer side of each peak signals are only counted,
+    because the errors depend on the inner sides.
 
     Args:
         signals: float64 (n,), scaled to 0 and 1 at the peaks.
-        loading: Fraction in the upper peak, roughly.
-        width_empty: Width of the lower peak, roughly.
-        width_full: Width of the upper peak, roughly.
+        loading: Approximate fraction in the upper peak.
+        width_empty: Approximate width of the lower peak.
+        width_full: Approximate width of the upper peak.
     """
     from scipy.optimize import minimize
 
@@ -124,7 +124,7 @@ def fit_shapes(signals: Floats, loading: float, width_empty: float, width_full: 
         below = (1 - full) * shapes.empty.below(ends)[0] + 1e-12
         above = full * shapes.full.above(ends)[1] + 1e-12
         outer = n_low * np.log((1 - shapes.between) * below) + n_high * np.log((1 - shapes.between) * above)
-        # 1e-7: a stray signal far from both peaks must not decide the fit
+        # 1e-7, because a stray signal far from both peaks must not decide the fit
         return -float(counts @ np.log(density + 1e-7) + outer)
 
     full = np.clip(loading, 0.02, 0.98)
@@ -151,8 +151,8 @@ def _bounds(start: Floats) -> Floats:
 
 
 def _shapes(x: Floats) -> tuple[Shapes, float]:
-    """The shapes that the parameters of the fit describe, and the fraction in the upper peak."""
-    # any number is allowed: widths are given as logarithms, fractions as log-odds
+    """The shapes for parameters of the fit, and the fraction in the upper peak."""
+    # any number is allowed, because widths are given as logarithms and fractions as log-odds
     empty = Peak(float(x[0]), float(np.exp(x[1])), float(x[2]))
     full = Peak(float(x[3]), float(np.exp(x[4])), float(x[5]))
     return Shapes(empty, full, float(1 / (1 + np.exp(-x[7])))), float(1 / (1 + np.exp(-x[6])))
@@ -167,11 +167,11 @@ class FittedThresholds:
         false_negative: float64 (n_rows, n_cols), probability that an atom is missed.
         false_positive: float64 (n_rows, n_cols), probability that an empty site is taken for full.
         loading: float64 (n_rows, n_cols), fraction of the frames above the threshold.
-        never_loaded: bool (n_rows, n_cols), sites with the lower peak only; the upper one is as far
-            from it as on their neighbours.
-        always_loaded: bool (n_rows, n_cols), sites with the upper peak only; the lower one is that of
+        never_loaded: bool (n_rows, n_cols), sites with only the lower peak. Their upper peak is assumed as
+            far from it as for their neighbours.
+        always_loaded: bool (n_rows, n_cols), sites with only the upper peak. Their lower peak is taken from
             their neighbours.
-        lost: Fraction of the signals between the peaks: atoms lost during the exposure.
+        lost: Fraction of the signals between the peaks, from atoms lost during the exposure.
     """
 
     thresholds: Floats
@@ -190,7 +190,7 @@ class FittedThresholds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SitePeaks:
-    """The two peaks of each site: positions, widths and numbers of signals, float64 (n_sites,).
+    """Positions, widths and numbers of signals of each site's two peaks, float64 (n_sites,).
 
     ``two`` is true for the sites that show both peaks, bool (n_sites,).
     """
@@ -207,21 +207,20 @@ class _SitePeaks:
 def fit_thresholds(signals: Floats, miss_cost: float = 3.0) -> FittedThresholds:
     """Fit the two peaks of each site and choose the threshold with the lowest cost of errors.
 
-    All sites share the shape of the peaks, because the errors are in tails that a site
-    shows once in thousands of frames. Each site has its own positions and widths, shrunk
-    towards the mean of all sites as far as chance explains (James and Stein, Proc. 4th
-    Berkeley Symp. 1, 361, 1961).
+    All sites share the shape of the peaks, because errors come from tails that a site shows once in thousands
+    of frames. Each site has its own positions and widths, shrunk towards the mean of all sites as far as
+    chance explains (James and Stein, Proc. 4th Berkeley Symp. 1, 361, 1961).
 
     Args:
         signals: float64 (n_frames, n_rows, n_cols), the detector's signals, from
             frames of randomly loaded atoms.
-        miss_cost: Cost of a missed atom, relative to a false detection. A second atom is moved onto
-            a missed one and both are lost; a false detection leaves a site empty.
+        miss_cost: Cost of a missed atom, relative to a false detection. A second atom is moved onto a missed
+            atom and both are lost, but a false detection only leaves a site empty.
 
     Raises:
-        LimitError: Fewer than 30 frames, or a cost that is not above 0.
-        DeviceError: A signal is not finite, or more than 20 % of the sites (and more than one) show one
-            peak only, or all of them.
+        LimitError: There are fewer than 30 frames, or the cost is not above 0.
+        DeviceError: A signal is not finite, or too many sites show only one peak. Too many are all sites, or
+            more than 20 % and more than one.
     """
     n_frames, *shape = signals.shape
     if n_frames < MIN_FRAMES:
@@ -263,7 +262,7 @@ def _site_peaks(by_site: Floats) -> _SitePeaks:
     apart = (full - empty) / np.maximum(np.hypot(width_empty, width_full), 1e-300)
     few = np.minimum(n_empty, n_full) < 5
     two = np.isfinite(apart) & (apart > 3.0) & ~few  # a single peak cut in two has 2.0
-    if two.any():  # peaks much closer than usual are not those of an empty and a full site
+    if two.any():  # peaks much closer than usual are not from an empty and a full site
         two &= full - empty > 0.4 * np.median((full - empty)[two])
     return _SitePeaks(empty, full, width_empty, width_full, n_empty, n_full, two)
 
@@ -290,28 +289,28 @@ def _moments(by_site: Floats, part: Bools) -> tuple[Floats, Floats, Floats]:
 
 def _check_enough(two: Bools, by_site: Floats) -> None:
     n_one = int((~two).sum())
-    # one site of a small array may always be broken, and one in five of a large one
+    # one site of a small array may always be broken, and one in five of a large array
     if n_one > max(1.0, 0.2 * len(two)) or not two.any():
         remedy = "check the loading, the light, and that the sites are where the atoms are"
         if np.ptp(by_site) == 0:
-            remedy = "all signals are equal: black or saturated frames"
+            remedy = "all signals are equal, so the frames may be black or saturated"
         raise DeviceError(
             "detector",
-            f"{n_one} of {len(two)} sites show one peak in the histogram of the counts, not two; {remedy}",
+            f"{n_one} of {len(two)} sites show only one peak in the histogram of the counts; {remedy}",
         )
 
 
 def _with_single_peaks(
     peaks: _SitePeaks, by_site: Floats, shape: tuple[int, int]
 ) -> tuple[_SitePeaks, Bools, Bools]:
-    """Shrink the peaks towards the mean of all; a site with one peak gets the other from its neighbours."""
+    """Shrink the peaks towards the mean of all. A site with one peak gets the other from its neighbours."""
     two = peaks.two
     error_empty, error_full = (
         width / np.sqrt(np.maximum(n, 1))
         for width, n in ((peaks.width_empty, peaks.n_empty), (peaks.width_full, peaks.n_full))
     )
     empty, full = _shrunk(peaks.empty, error_empty, two), _shrunk(peaks.full, error_full, two)
-    # the standard error of a width is 0.71 of that of the mean for a Gaussian, more for a skewed peak
+    # the standard error of a width is 0.71 times that of the mean for a Gaussian, more for a skewed peak
     width_empty = _shrunk(peaks.width_empty, 0.85 * error_empty, two)
     width_full = _shrunk(peaks.width_full, 0.85 * error_full, two)
     near_empty, near_full = (_of_neighbours(values, two, shape) for values in (empty, full))
@@ -324,7 +323,7 @@ def _with_single_peaks(
 
 
 def _of_neighbours(values: Floats, known: Bools, shape: tuple[int, int]) -> Floats:
-    """For each site the median of the eight nearest sites whose values are known."""
+    """The median of the eight nearest sites with known values, for each site."""
     from scipy.spatial import KDTree
 
     site = np.stack(np.unravel_index(np.arange(len(values)), shape), axis=1)
@@ -354,7 +353,7 @@ def _cheapest(
 ) -> tuple[Floats, Floats, Floats]:
     """Threshold of each site between 0 and 1, and probabilities of a missed atom and a false detection."""
     at = np.linspace(0.02, 0.98, 1921)
-    # widths in steps of 2.5 %: sites of nearly the same width share a curve, instead of one for each site
+    # widths in steps of 2.5 %, so that sites of nearly the same width share a curve
     steps = np.exp(np.linspace(np.log(0.5), np.log(2.0), 57))
     imagined = np.stack([shapes.empty.widened(step).above(at) for step in steps])
     missed = np.stack([shapes.full.widened(step).below(at) for step in steps])
@@ -371,22 +370,21 @@ def _cheapest(
 
 
 ENOUGH_SIGNALS: Final = 4000
-"""Signals of all sites together; with fewer, thresholds may cost more than 1.3 times the best."""
+"""Number of signals of all sites below which thresholds may cost more than 1.3 times the best."""
 
 
 def analyse_thresholds(data: CalibrationData) -> AnalysisResult:
     """Find the thresholds from the signals that the profile's detector computes from the run's frames.
 
     Raises:
-        DeviceError: The frames are of another size than those of the sites, or too many sites
-            show one peak only.
+        DeviceError: The frames have another size than for the sites, or too many sites show only one peak.
         LimitError: There are too few frames.
         ConfigError: The detector does not report its signals, or the run has no frames.
     """
     detector, choice = data.detector(), data.hardware.chosen["detector"]
     if not isinstance(detector, ReportsSignals):
         problem = f"the detector '{choice.entry.name}' does not report the signals that it compares"
-        raise ConfigError(Problem(problem, expected="'threshold', 'weighted', or another that does"))
+        raise ConfigError(Problem(problem, expected="'threshold', 'weighted', or another such detector"))
     signals = np.stack([detector.signals(frame) for frame in data.frames()])
     fitted, unit = fit_thresholds(signals), detector.signal_unit
     quality = {
@@ -412,7 +410,7 @@ def _n_not_by_chance(fitted: FittedThresholds, n_frames: int) -> int:
     n_full, usual = np.rint(fitted.loading * n_frames), float(np.median(fitted.loading))
     chance = np.minimum(bdtr(n_full, n_frames, usual), bdtrc(n_full - 1, n_frames, usual))
     one_peak = fitted.never_loaded | fitted.always_loaded
-    # in one array of a thousand, a site is counted that is only by chance never, or always, loaded
+    # in one array of a thousand, this counts a site that is never or always loaded by chance
     return int(np.count_nonzero(one_peak & (chance < 1e-3 / one_peak.size)))
 
 
@@ -421,17 +419,17 @@ def _summary_lines(fitted: FittedThresholds, n_frames: int, unit: str) -> tuple[
     missed, imagined = fitted.false_negative.mean(), fitted.false_positive.mean()
     loading = f"{100 * fitted.loading.mean():.1f} % of the sites hold atoms"
     lines = [
-        f"thresholds from {low:.4g} to {high:.4g} {unit}, of {n_frames} frames; {loading}",
+        f"thresholds from {low:.4g} to {high:.4g} {unit}, from {n_frames} frames; {loading}",
         f"expected: {missed:.1e} of the atoms missed, {imagined:.1e} of the empty sites taken for full",
     ]
     if n_frames * fitted.loading.size < ENOUGH_SIGNALS:
         n_shots = -(-ENOUGH_SIGNALS // fitted.loading.size)
-        text = "few signals: thresholds and expected errors may be far off; take"
+        text = "with few signals, thresholds and expected errors may be far off; take"
         lines.append(f"warning: {text} --shots {n_shots}")
     for sites, word in ((fitted.never_loaded, "never"), (fitted.always_loaded, "always")):
         if sites.any():
             lines.append(
-                f"warning: {_named(sites)} {word} loaded; the missing peak is that of the neighbours"
+                f"warning: {_named(sites)} {word} loaded, so the missing peak is taken from the neighbours"
             )
     return tuple(lines)
 

@@ -111,7 +111,7 @@ class Document:
         if root is None or root.value is None:
             raise ConfigError(Problem("the file is empty", name, expected=expected))
         if not isinstance(root.value, dict):
-            what = f"the top level of the file is {shown(root.plain(), root.raw)}"
+            what = f"the top level is {shown(root.plain(), root.raw)}"
             raise root.mark.error(what, expected)
         return cls(Path(name), decoded, root)
 

@@ -354,8 +354,7 @@ def evaluate(root: Node, text: str) -> tuple[Node, dict[Loc, str], dict[Loc, fro
         text: Its text, for places within expressions.
 
     Returns:
-        The file with the values of its expressions, the text of each expression, and the places of all values
-        that each expression depends on.
+        The file with computed values, the text of each expression, and the places on which each depends.
 
     Raises:
         ConfigError: All errors in them.

@@ -100,11 +100,10 @@ class Scan:
     def points_of_shots(self, seed: int, n_shots: int) -> NDArray[np.int32]:
         """Number of the point of each shot, int32 (n_shots,).
 
-        Shots beyond n_points * repeats begin the scan again, so that a run can have more shots.
-
-        A sequential scan takes all shots of a point before the next point. A shuffled scan takes every point
-        once per round, in an order drawn from the run's seed. A drift of the machine then affects all points
-        equally, even in a run that is stopped early.
+        Shots beyond n_points * repeats begin the scan again, so that a run can have more shots. A sequential
+        scan takes all shots of a point before the next point. A shuffled scan takes every point once per
+        round, in an order drawn from the run's seed. A drift of the machine then affects all points equally,
+        even in a run that is stopped early.
         """
         points = np.arange(self.n_points, dtype=np.int32)
         if self.order == "sequential":
@@ -148,7 +147,7 @@ class Scan:
 
         def with_address(problem: Problem) -> Problem:
             address = places.get((problem.source, problem.line, problem.column))
-            note = f"this value comes from the scan of '{clean(address or '')}'"
+            note = f"from the scan of '{clean(address or '')}'"
             if address is None or note in problem.notes:
                 return problem
             return replace(problem, notes=(*problem.notes, note))
@@ -307,8 +306,7 @@ def load_scan(
         problems: Receives the problems of the scan.
 
     Returns:
-        The copy, with ``shots`` from the scan, and the scan. For an invalid scan, a copy without it, and
-        None.
+        The copy, with ``shots`` from the scan, and the scan. If it is invalid, a copy without it and None.
     """
     try:
         scan = read_scan(document, [*overrides, *profile_set])

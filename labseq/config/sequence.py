@@ -142,8 +142,7 @@ class PolicySettings(Settings):
 
     on_failure: Then | None = Field(
         default=None,
-        description="reaction to a failure. By default a transient failure repeats the shot, any other stops "
-        "the run",
+        description="reaction to a failure, by default to repeat the shot if it is transient, else to stop",
     )
     when_exhausted: WhenExhausted = Field(
         default="stop", description="reaction when a shot has failed `attempts` times"
@@ -288,8 +287,7 @@ class SequenceSpec(Settings):
     repeats: int = Field(default=1, ge=1, le=1_000_000, description="shots at each point of the scan")
     order: ScanOrder = Field(default="sequential", description="order of the scan's shots")
     leader: LeaderPermissions | None = Field(
-        default=None,
-        description="settings that another control system may change with each `go`",
+        default=None, description="settings that another control system may change with `go`"
     )
     measure: Measures = Field(
         default=None,

@@ -323,7 +323,9 @@ def test_a_row_that_does_not_follow_its_tone_is_named() -> None:
     array = Array(8)
     apply = array.apply
     array.apply = lambda rows, cols: apply(np.where(np.arange(20) == 5, 0.7 * np.median(rows), rows), cols)
-    with pytest.raises(DeviceError, match=r"spread stays at .*; the spots of row 5 have 0\.\d+ times the"):
+    with pytest.raises(
+        DeviceError, match=r"spread stays at .*, and the spots of row 5 have 0\.\d+ times the"
+    ):
         begin(array)
     with pytest.raises(DeviceError, match="after 3 rounds"):
         begin(Array(10), EqualiseSettings(gain=0.1, max_rounds=3))

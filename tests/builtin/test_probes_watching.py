@@ -199,7 +199,7 @@ def test_sites_that_have_moved_are_a_warning_with_the_shift() -> None:
     _, observer = sites_run((-0.6, 0.4), loaded(0.75))
     (warning,) = observer.of("warning")
     assert warning["text"].startswith("shot 0: the sites have moved by -0.6")
-    assert warning["text"].endswith("; the limit is 0.5 px: run `labseq calibrate sites`")
+    assert warning["text"].endswith(", limit 0.5 px); run `labseq calibrate sites`")
     with pytest.raises(DeviceError, match=r"camera: the sites have moved by \+1\.\d+ px down and"):
         sites_run((1.2, 0.0), loaded(0.6), exceeded="stop")
 
@@ -211,8 +211,8 @@ def test_too_few_atoms_are_no_drift(n_atoms: int) -> None:
     shots, observer = sites_run((0.9, 0.0), occupied, exceeded="stop")
     (warning,) = observer.of("warning")
     assert warning["text"] == (
-        f"shot 0: check_sites cannot locate the sites with {n_atoms} atoms seen on them: "
-        "few were loaded, or the sites are far from where the detector looks"
+        f"shot 0: check_sites cannot locate the sites from {n_atoms} atoms, because "
+        "few were loaded or the sites are far from where the detector looks"
     )
     assert "sites.shift_y_px" not in shots[0].readings
 

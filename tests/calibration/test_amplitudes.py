@@ -68,7 +68,7 @@ def test_amplitudes_measured_on_frames_make_the_depths_of_moves_equal(tmp_path: 
             "profile.mobile_tweezers.max_column_tones=9",
             "number of column tones at once, to measure",
         ),
-        ("shot.0.equalise.device=meter", "'meter' is not a camera; mobile tweezers are measured on frames"),
+        ("shot.0.equalise.device=meter", "'meter' is not a camera; choose a camera for mobile tweezers"),
     ],
 )
 def test_what_cannot_be_measured_is_refused(change: str, message: str, tmp_path: Path, make_lab: Any) -> None:

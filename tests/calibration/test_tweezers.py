@@ -179,7 +179,7 @@ def test_the_sites_of_an_slm_are_equalised_one_by_one(
     assert len(again.run.shots[0].readings["equalise.spreads"]) <= 2
     outcome = lab.calibrate("tweezers")  # of the virtual static tweezers, which have tones
     assert "weights" not in outcome.stored.entry.values
-    with pytest.raises(DeviceError, match=r"is one number, .* weights of sites need a camera, or an array"):
+    with pytest.raises(DeviceError, match=r"is one number, .* for weights of sites use a camera or an array"):
         lab.calibrate("tweezers", overrides=[BY_SLM, *TOTAL])
 
 

@@ -71,10 +71,10 @@ def test_the_lion_head_is_a_drawing_without_margins() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("#.#\n##\n", r"drawing\.txt:2:1: row 2 of the drawing has 2 characters and row 1 has 3"),
+        ("#.#\n##\n", r"drawing\.txt:2:1: row 2 of the drawing has 2 characters, but row 1 has 3"),
         ("\n\n#.#\n##\n", r"drawing\.txt:4:1: row 2 of the drawing"),
         ("", "the drawing is empty"),
-        ("...\n...\n", "the drawing holds no atom; draw an atom as one of '#'"),
+        ("...\n...\n", "the drawing has no atom; draw an atom as one of '#'"),
         ("#\n" * 600_000, "the file is larger than 1024 KiB"),
     ],
 )
@@ -90,7 +90,7 @@ def test_a_wrong_picture_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"drawing\.png: this is not a readable PNG"):
         read_drawing(file)
     Image.new("L", (3, 2), 255).save(file)
-    with pytest.raises(ConfigError, match=r"the picture holds no atom; make the pixels of atoms dark"):
+    with pytest.raises(ConfigError, match=r"the picture has no atom; make the pixels of atoms dark"):
         read_drawing(file)
     Image.new("1", (MAX_PIXELS + 1, 2)).save(file)
     with pytest.raises(ConfigError, match=r"the picture has 2 x 1025 pixels; expected one pixel per site"):
@@ -165,10 +165,10 @@ def test_a_drawing_may_be_part_of_the_sequence(tmp_path: Path) -> None:
     ("settings", "message"),
     [
         ("", r"sequence\.yaml:6:9: a bitmap needs a drawing; expected 'sites' or 'file'"),
-        (", sites: '#', file: a.txt", r"sequence\.yaml:6:39: 'file' excludes 'sites'"),
+        (", sites: '#', file: a.txt", r"sequence\.yaml:6:39: 'file' and 'sites' are both given"),
         (", sites: '#', fill: ''", r"sequence\.yaml:6:45: fill has 0 characters"),
         (", file: a.txt", r"sequence\.yaml:6:33: .*a\.txt: there is no such file"),
-        (", sites: '...'", r"sequence\.yaml:6:34: the drawing holds no atom"),
+        (", sites: '...'", r"sequence\.yaml:6:34: the drawing has no atom"),
     ],
 )
 def test_wrong_settings_are_errors_with_their_place(settings: str, message: str, tmp_path: Path) -> None:

@@ -81,7 +81,10 @@ def test_what_comes_out(text: str, expected: Any) -> None:
         ("= variables.hold + 5", "22: a time and a number cannot be added; give the number its unit"),
         ('"= min(2 ms, 3)"', "8: a time and a number cannot be compared"),
         ("= variables.hodl", "7: there is no 'variables.hodl' in this file; did you mean 'hold'?"),
-        ("= shot.0.image.gain", "7: there is no 'shot.0.image.gain' in this file; an expression can only use"),
+        (
+            "= shot.0.image.gain",
+            "7: there is no 'shot.0.image.gain' in this file; an expression can only use",
+        ),
         ("= shot.0.image", "7: 'shot.0.image' is a mapping"),
         ("= shot.0.image.name", "7: 'shot.0.image.name' is 'x'; expected a number or a quantity"),
         ("= 1 / variables.zero", "9: this divides by zero"),

@@ -182,7 +182,10 @@ BAD = [
         "scan: {shot.sort.window: [1], shot.2.rearrange.window: [2]}",
         "1:31: 'shot.2.rearrange.window' is scanned",
     ),
-    ("scan: {shot.sort: [{}], shot.sort.window: [2]}", "1:25: 'shot.sort.window' and 'shot.sort' are both scanned"),
+    (
+        "scan: {shot.sort: [{}], shot.sort.window: [2]}",
+        "1:25: 'shot.sort.window' and 'shot.sort' are both scanned",
+    ),
     ("scan: {shots: [1, 2]}", "1:8: a scan cannot change 'shots'; expected an address in 'planner'"),
     ("scan: {shot.2.name: [a, b]}", "1:8: a scan cannot change 'shot.2.name'"),
     ("scan: {shot.srt.window: [1, 2]}", "1:8: 'shot' has no item 'srt'"),

@@ -200,7 +200,7 @@ stop_when: 'never' => stop_when: nevr
 - image: {exposure: 45 ms} => - ramp: {depth: 150 %}
   16:19: depth is '150 %'; expected at most 1 (in SI units)
 - image: {exposure: 45 ms} => - ramp: {duration: 5 ms}
-  16:11: 'depth' is missing from 'ramp' (depth at the end, as a fraction of the nominal one)
+  16:11: 'depth' is missing from 'ramp' (depth at the end, as a fraction of the nominal depth)
 delay: 2 => delay: [2]
   25:58: delay is a list; expected text, a whole number, a number or true or false
 do: open,  => ∅
@@ -208,7 +208,7 @@ do: open,  => ∅
 wait: {duration: 1 ms} => wait:
   26:10: a wait needs a time or a signal; expected 'duration', or 'for' and 'timeout'
 wait: {duration: 1 ms} => wait: {duration: 1 ms, for: go, timeout: 1 s}
-  26:12: 'duration' excludes 'for'; expected one of them
+  26:12: 'duration' is given with 'for'; expected one of them
 wait: {duration: 1 ms} => wait: {for: go}
   26:12: a wait for 'go' has no 'timeout'; expected the longest wait
 wait: {duration: 1 ms} => wait: {duration: 1 ms, timeout: 1 s}

@@ -197,7 +197,7 @@ BOTH = "from: 1, to: 9"
         ),
         (
             f"use: climb, over: {{{DOP}: {{from: 0, to: 9}}}}, maximise: success, points: 3",
-            f"comes from the scan of '{DOP}'",
+            f"from the scan of '{DOP}'",
         ),
         (f"use: climb, {OVER}, minimise: success, points: 3", "'maximise' and 'minimise' are both given"),
         (

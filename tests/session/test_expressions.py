@@ -144,7 +144,9 @@ def test_a_wrong_scan_of_a_variable_is_refused(tmp_path: Path, scan: str, messag
 
 def test_what_a_run_has_one_of_cannot_follow_from_a_scan(tmp_path: Path) -> None:
     rest = "scan: {variables.dop: [1, 2]}\nattempts: = variables.dop\n"
-    with pytest.raises(ConfigError, match=r"a scan cannot change 'attempts', which depends on 'variables.dop'"):
+    with pytest.raises(
+        ConfigError, match=r"a scan cannot change 'attempts', which depends on 'variables.dop'"
+    ):
         opened(tmp_path, rest)
     (tmp_path / "s.yaml").write_text(
         SEQUENCE.replace("= variables.dop", "2") + "scan: {variables.dop: [1, 2]}\n"

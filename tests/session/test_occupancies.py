@@ -109,7 +109,10 @@ def test_one_of_several_occupancies_in_the_files_of_other_programs(tmp_path: Pat
         ("two.npz:load#1", "it holds no array 'load'; expected one of loaded, after; did you mean 'loaded'?"),
         ("two.npz:loaded", "it holds 2 occupancies; expected"),
         ("two.npz:loaded#2", "there is no occupancy '2'; expected 0 to 1"),
-        ("one.npz#0", "the array has shape (2, 3); expected (rows, columns), or (occupancies, rows, columns)"),
+        (
+            "one.npz#0",
+            "the array has shape (2, 3); expected (rows, columns), or (occupancies, rows, columns)",
+        ),
         ("a.h5", "is not a shot's file of labseq; expected a shot's file; name the array"),
         ("a.h5:time", "holds no array 'time'; expected scan 1/loaded (2, 2, 3)"),
         ("b.npz", "there is no such file"),
@@ -189,7 +192,7 @@ def test_texts_are_read_as_they_were_written(occupancy: Occupancy, signs: str, b
         ),
         (b"[[1, 0], 1]\n", "mine:1:10: '1' is not within a row"),
         (b"[[1, 0],\n [1]]\n", "mine:2:4: this row has 1 sites"),
-        (b"1" * (MAX_BYTES + 1), "this text is larger than 32 MiB"),
+        (b"1" * (MAX_BYTES + 1), "this is larger than 32 MiB"),
     ],
 )
 def test_other_texts_are_refused_with_their_place(text: bytes, words: str) -> None:

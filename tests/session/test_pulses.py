@@ -51,7 +51,12 @@ def written(folder: Path, pulse: str) -> Path:
         ("{lines: [microwave], duration: 12.3 us}", [BOX], (10, 38), "at least 5 us, in steps of 500 ns"),
         ("{lines: [microwave], duration: 4.5 us}", [BOX], (10, 38), "at least 5 us, in steps of 500 ns"),
         ("{lines: [microwave, push_out], duration: 9 us}", [EXCLUSIVE], (10, 48), "mutually exclusive"),
-        ("{lines: [microwave], duration: 9 us}", ["profile=paper"], (10, 7), "nothing on this profile can"),
+        (
+            "{lines: [microwave], duration: 9 us}",
+            ["profile=paper"],
+            (10, 7),
+            "no device of this profile can time",
+        ),
         (
             "{repeat: 12, parts: {a: {lines: [microwave], duration: 9 us}, b: {duration: 9 us}}}",
             [BOX],
@@ -59,7 +64,7 @@ def written(folder: Path, pulse: str) -> Path:
             "number of edges is 24; the limit is at most 23",
         ),
         ("{lines: [microwave]}", [], (10, 7), "a pulse has no duration; expected 'duration', or 'parts'"),
-        ("{lines: [], parts: {a: {duration: 9 us}}}", [], (10, 8), "'lines' beside 'parts'"),
+        ("{lines: [], parts: {a: {duration: 9 us}}}", [], (10, 8), "'lines' is set with 'parts'"),
         ("{repeat: 9999, parts: {a: {duration: 0}, b: {duration: 0}}}", [], (10, 16), "19998 pulses"),
         ("parts: {a.b: {duration: 9 us}}", [], (10, 15), "the name 'a.b' has a dot"),
     ],

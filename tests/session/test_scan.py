@@ -130,14 +130,14 @@ WRONG = [
     (
         "scan: {planner.degree_of_parallelism: [0, 3, x], profile.mobile_tweezers.speed: [1 m/s, -2 m/s]}",
         [
-            "40: degree_of_parallelism is 0 (this value comes from the scan of 'planner.degree_of_parallelism')",
-            "46: degree_of_parallelism is 'x' (this value comes from the scan of 'planner.degree_of_parallelism')",
-            "89: speed is '-2 m/s' (this value comes from the scan of 'profile.mobile_tweezers.speed')",
+            "40: degree_of_parallelism is 0 (from the scan of 'planner.degree_of_parallelism')",
+            "46: degree_of_parallelism is 'x' (from the scan of 'planner.degree_of_parallelism')",
+            "89: speed is '-2 m/s' (from the scan of 'profile.mobile_tweezers.speed')",
         ],
     ),
     (
         "scan: {shot.sort.cycles: [2, 3], shot.sort.window: [[60 ms, 40 ms], 60 ms]}",
-        ["53: the list has 2 entries, but cycles is 3 (this value comes from the scan of 'shot.sort.window')"],
+        ["53: the list has 2 entries, but cycles is 3 (from the scan of 'shot.sort.window')"],
     ),
     ("scan: {profile.camera.gian: [3, 4]}", ["8: 'gian' is not a setting of camera 'virtual' ("]),
     ("scan: {profile.grid.rows: [19, 20]}", ["8: a scan cannot change 'profile.grid.rows' ("]),
@@ -145,7 +145,7 @@ WRONG = [
     ("scan: {profile.camera.use: [virtual, andor]}", ["38: a scan cannot change the driver of camera ("]),
     (
         "scan: {profile.mobile_tweezers: [{use: spcm, card: simulated}, {use: spcm, card: /dev/spcm0}]}",
-        ["64: the scan would change whether mobile_tweezers is simulated (this value comes from the scan of"],
+        ["64: the scan would change whether mobile_tweezers is simulated (from the scan of"],
     ),
 ]
 
