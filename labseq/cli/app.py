@@ -1,4 +1,4 @@
-"""The command line: all commands and their options; the code of a command is imported when it runs."""
+"""The command line: all commands and their options. A command's code is imported when it runs."""
 
 from functools import partial
 from pathlib import Path
@@ -147,10 +147,10 @@ def common(
         typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True),
     ] = False,
     _debug: Annotated[
-        bool, typer.Option("--debug", help="Print the traceback of an error; also allowed after the command.")
+        bool, typer.Option("--debug", help="Print the traceback of an error. Also allowed after the command.")
     ] = False,
 ) -> None:
-    """Declare the options before the command; ``main`` reads ``--debug`` itself."""
+    """Declare the options before the command. ``main`` reads ``--debug`` itself."""
 
 
 app.add_typer(bench)
@@ -164,14 +164,14 @@ app.command(epilog=CALIBRATE_EXAMPLES, short_help="Calibrate sites, tones, timin
 @app.command(short_help="Run an example sequence on simulated hardware.")
 def demo(
     shots: Annotated[
-        int | None, whole_number_option("Number of shots; default: 10.", show_default=False)
+        int | None, whole_number_option("Number of shots (default 10).", show_default=False)
     ] = None,
     output: Output = None,
     copy: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Run nothing; copy the packaged sequences and profiles to this folder, for you to change.",
+            help="Only copy the packaged sequences and profiles to this folder, for you to change.",
         ),
     ] = None,
 ) -> None:
@@ -182,7 +182,7 @@ def demo(
         run_demo(shots, output)
         return
     if shots is not None or output is not None:
-        raise typer.BadParameter("it runs nothing; leave out --shots and --output", param_hint="--copy")
+        raise typer.BadParameter("it only copies files; leave out --shots and --output", param_hint="--copy")
     copy_files(copy)
 
 
@@ -220,14 +220,14 @@ def resume(
     shots: Annotated[
         int | None,
         whole_number_option(
-            "Give the run more shots, N in all; it may be complete. A scan begins again after its last shot."
+            "New total number of shots, also for a complete run. When a scan is through, it starts over."
         ),
     ] = None,
     accept_changes: Annotated[
         bool,
         typer.Option(
             "--accept-changes",
-            help="Resume even if code, plugins or settings have changed since; run.json records the changes.",
+            help="Resume even if code, plugins or settings have changed since. run.json records the changes.",
         ),
     ] = False,
     as_json: Json = False,
@@ -244,9 +244,9 @@ def resume(
 @app.command(epilog=RERUN_EXAMPLES, short_help="Take a run again.")
 def rerun(
     run: Annotated[Path, run_argument("The run's folder, name or number.")],
-    same_seed: Annotated[bool, typer.Option("--same-seed", help="Take its random numbers, too.")] = False,
+    same_seed: Annotated[bool, typer.Option("--same-seed", help="Use the same random numbers.")] = False,
     shots: Annotated[
-        int | None, whole_number_option("Number of shots, instead of that of the earlier run.")
+        int | None, whole_number_option("Number of shots, if not the same as in the earlier run.")
     ] = None,
     output: Output = None,
     note: Note = "",
@@ -255,10 +255,10 @@ def rerun(
     realtime: Realtime = False,
     _plugins: Plugins = None,
 ) -> None:
-    """Take a run again, as a new run with the same sequence, profile and options.
+    """Take a run again as a new run with the same sequence, profile and options.
 
-    The texts of the files are those that the earlier run began with; plugins and calibrations are those of
-    today. What differs from the earlier run is printed before the first shot.
+    The sequence and profile are read as they were when the earlier run began, but plugins and calibrations as
+    they are now. Whatever differs from the earlier run is printed before the first shot.
     """
     from labseq.cli.run import rerun_run
 
@@ -269,15 +269,15 @@ def rerun(
 @app.command(short_help="End a run in progress after its current shot.")
 def stop(
     run: Annotated[
-        Path | None, run_argument("The run's folder, name or number; default: the run in progress.")
+        Path | None, run_argument("The run's folder, name or number. Default: the run in progress.")
     ] = None,
     profile: Annotated[str | None, profile_option("Stop the run that uses this profile.")] = None,
     queue: Annotated[
-        bool, typer.Option("--queue", help="Also let `labseq queue run` start no further entry.")
+        bool, typer.Option("--queue", help="Also keep `labseq queue run` from starting another entry.")
     ] = False,
     wait: Annotated[bool, typer.Option("--wait", help="Wait until the run has ended.")] = False,
 ) -> None:
-    """Ask a run in progress to end after its current shot; its devices are then made safe."""
+    """Ask a run in progress to end after its current shot. Its devices are then made safe."""
     from labseq.cli.run import stop_run
 
     stop_run(run, profile, queue=queue, wait=wait)
@@ -286,14 +286,14 @@ def stop(
 @queue.command("run", short_help="Run the queued entries one after the other.")
 def run_queue(
     keep_going: Annotated[
-        bool, typer.Option("--keep-going", help="Continue with the next entry after one that failed.")
+        bool, typer.Option("--keep-going", help="Continue with the next entry if one fails.")
     ] = False,
     watch: Annotated[
         bool, typer.Option("--watch", help="Wait for new entries when the queue is empty, until stopped.")
     ] = False,
     _plugins: Plugins = None,
 ) -> None:
-    """Run the queued entries one after the other; a run that was interrupted is resumed first."""
+    """Run the queued entries one after the other. An interrupted run is resumed first."""
     from labseq.cli.run import calibrate_for_queue, run_session
     from labseq.queue.running import run_entries
 
@@ -307,16 +307,16 @@ def run_campaign(
     output: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the campaign.", show_default=False)],
     netcdf: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write the results of all points here, as labseq export does."),
+        typer.Option(metavar="FILE", help="Write the results of all points here, like labseq export."),
     ] = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,
     keys: Keys = None,
     _plugins: Plugins = None,
 ) -> None:
-    """Run a sequence at each point of a grid of values, in one or several runs each.
+    """Run a sequence at each point of a grid of values, with one or more runs per point.
 
-    The same command continues a campaign that was stopped.
+    The same command continues a stopped campaign.
     """
     from labseq.analysis.campaigns import export_campaign, results_of
     from labseq.campaigns.commands import run_file
@@ -333,7 +333,7 @@ def run_campaign(
         export_campaign(folder, netcdf)
 
 
-@app.command(short_help="Check a sequence; print its timeline and limits.")
+@app.command(short_help="Check a sequence and print its timeline and limits.")
 def check(
     sequence: SequenceFile,
     profile: Profile = None,
@@ -342,7 +342,7 @@ def check(
     as_json: Json = False,
     _plugins: Plugins = None,
 ) -> None:
-    """Check a sequence: print every error and warning, the timeline and the limits. No device is opened."""
+    """Print every error and warning of a sequence, its timeline and its limits. No device is opened."""
     from labseq.cli.check import check_sequence
 
     check_sequence(sequence, profile, overrides or (), dry_run_mode(dry_run), as_json=as_json)
@@ -362,17 +362,17 @@ def runs(
         str,
         typer.Option(
             metavar="NAME",
-            help="Sort by a result, a changed setting or the shots, the greatest last, with -NAME the least "
-            "last; default: by time, the newest last.",
+            help="Sort by a result, a changed setting or the number of shots, the greatest last. With -NAME "
+            "the least comes last. Default: by time, the newest last.",
         ),
     ] = "",
     limit: Annotated[int, typer.Option(metavar="N", min=1, help="At most N runs, the last ones.")] = 20,
     as_json: Json = False,
 ) -> None:
-    """List the runs in a data folder, the newest last: what each has scanned and measured, and its note.
+    """List the runs in a data folder, the newest last, with scans, results and notes.
 
-    The first column is a name by which all commands accept a run. Its number or the name of its sequence
-    will do; it is then the newest of them.
+    Every command accepts the name in the first column. A run's number or the name of its sequence also
+    works and means the newest such run.
     """
     from labseq.cli.runs import RunQuery, list_runs
 
@@ -386,19 +386,17 @@ def note(
     run: Annotated[Path, run_argument("The run's folder, name or number.")],
     text: Annotated[
         str | None,
-        typer.Argument(
-            metavar="TEXT", help="The note, instead of the present one; '' removes it.", show_default=False
-        ),
+        typer.Argument(metavar="TEXT", help="The new note. '' removes the present note.", show_default=False),
     ] = None,
     tags: Tags = None,
     untag: Annotated[
         list[str] | None,
-        typer.Option(metavar="TAG", help="Remove a tag; may be given several times."),
+        typer.Option(metavar="TAG", help="Remove a tag. May be given several times."),
     ] = None,
 ) -> None:
-    """Write a note about a run and tag it, finished or not; print what it then has.
+    """Write a note about a run or tag it, finished or not. Its note and tags are then printed.
 
-    labseq runs and the web page show and search note and tags.
+    labseq runs and the web page show notes and tags, and search them.
     """
     from labseq.cli.runs import write_note
 
@@ -409,7 +407,7 @@ app.command(epilog=SERVE_EXAMPLES, short_help="Serve devices to a labseq on anot
 app.command(epilog=WEB_EXAMPLES, name="web", short_help="Show runs, queue and calibrations in a browser.")(
     show_web
 )
-app.command(epilog=PLAN_EXAMPLES, short_help="Plan the moves for one occupancy; print or draw them.")(plan)
+app.command(epilog=PLAN_EXAMPLES, short_help="Plan the moves for one occupancy. Print or draw them.")(plan)
 app.command(epilog=WAVEFORM_EXAMPLES, short_help="Show what the AWG would play for a plan.")(waveform)
 
 
@@ -418,20 +416,18 @@ def show(
     run: RunFolder = None,
     shots: Annotated[bool, typer.Option("--shots", help="Print a row for every shot.")] = False,
     timing: Annotated[
-        bool, typer.Option("--timing", help="Print a row for each stage of a shot: its budget and duration.")
+        bool, typer.Option("--timing", help="Print a row with budget and duration for each stage of a shot.")
     ] = False,
     scan: ScanQuantities = None,
     where: Where = None,
     fit: FitName = None,
     fit_set: FitSettings = None,
     along: Along = None,
-    devices: Annotated[
-        bool, typer.Option("--devices", help="Print how each device described itself.")
-    ] = False,
+    devices: Annotated[bool, typer.Option("--devices", help="Print the description of each device.")] = False,
     as_json: Json = False,
     _plugins: Plugins = None,
 ) -> None:
-    """Show what a run has recorded, finished or not: its summary, or the tables that you choose.
+    """Show what a run has recorded, finished or not, as a summary or as the tables that you choose.
 
     Shots, attempts, cycles and scan points are counted from 0.
     """
@@ -446,7 +442,7 @@ def show(
 def watch(
     run: RunFolder = None,
     follow: Annotated[
-        bool, typer.Option("--follow", help="Wait for the next run then, and watch it, until Ctrl-C.")
+        bool, typer.Option("--follow", help="Then wait for the next run and watch it, until Ctrl-C.")
     ] = False,
 ) -> None:
     """Watch a run that another process takes, until it ends. Ctrl-C ends only the view."""
@@ -457,9 +453,9 @@ def watch(
 
 @app.command(short_help="Send a notice, to try notify.yaml.")
 def notify(
-    text: Annotated[str, typer.Argument(metavar="TEXT", help="What it says.")] = "a notice to try the way",
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="The text.")] = "a notice to try the way",
 ) -> None:
-    """Send a notice by every way that notify.yaml in the data folder names, and say what failed."""
+    """Send a notice in every way that notify.yaml in the data folder names, and print what failed."""
     from labseq.cli.run import try_notice
 
     try_notice(text)
@@ -480,7 +476,7 @@ def export(
         typer.Option(
             "--to",
             metavar="csv|parquet|netcdf|archive",
-            help="Kind of file: a table of the shots (csv, parquet), a table with occupancies on the axes "
+            help="Kind of file. A table of the shots (csv, parquet), a table with occupancies on the axes "
             "of the scan (netcdf), or everything in one HDF5 file (archive). Default: csv, or netcdf for "
             "a campaign.",
         ),
@@ -491,17 +487,17 @@ def export(
             "--output",
             "-o",
             metavar="FILE",
-            help="The file; default: one named after the run, in the current folder.",
+            help="Name of the file. Default: named after the run, in the current folder.",
         ),
     ] = None,
-    frames: Annotated[bool, typer.Option("--frames", help="Include the frames; for archive only.")] = False,
+    frames: Annotated[bool, typer.Option("--frames", help="Include the frames. Only for archive.")] = False,
     scan: ScanQuantities = None,
     where: Where = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
 ) -> None:
     """Export a run, or all runs of a campaign's folder, to one file that other programs can read.
 
-    With --scan a row for each point of the scan, csv only: scanned values, shots, means and their intervals.
+    With --scan (only csv): a row per point of the scan, with scanned values, shots, means and intervals.
     """
     from labseq.analysis.scanned import scan_request
     from labseq.cli.data import export_points, export_to
@@ -519,14 +515,14 @@ def doctor(
         Path | None,
         typer.Argument(
             metavar="DATA",
-            help="A data folder or one run; default: LABSEQ_DATA or ./data.",
+            help="A data folder or one run. Default: LABSEQ_DATA or ./data.",
             show_default=False,
         ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report; change nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Report without changing anything.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Find the damage that crashes and faulty disks did to recorded data, and repair it where possible."""
+    """Find damage to recorded data from crashes and faulty disks, and repair it where possible."""
     from labseq.cli.data import examine
 
     raise typer.Exit(examine(data, dry_run=dry_run, as_json=as_json))
@@ -560,7 +556,7 @@ def safe(
         bool | None,
         typer.Option(
             "--end/--no-end",
-            help="First end a process that uses the devices. Default: ask in a terminal, else end it.",
+            help="First end a process that uses the devices. Default: ask in a terminal, else do so.",
             show_default=False,
         ),
     ] = None,
@@ -568,8 +564,8 @@ def safe(
         bool,
         typer.Option(
             "--stand-by",
-            help="Wait, and do so with each device whose process dies without having made it safe, or hangs "
-            "for 5 s; until Ctrl-C.",
+            help="Wait until Ctrl-C, and make a device safe if its process hangs for 5 s or dies before "
+            "making it safe.",
         ),
     ] = False,
     overrides: Overrides = None,
@@ -579,14 +575,14 @@ def safe(
     from labseq.cli.devices import secure_profile, stand_by_for
 
     if wait and end:
-        raise typer.BadParameter("--stand-by leaves processes that answer alone; leave out --end")
+        raise typer.BadParameter("--stand-by never ends a process that still answers; leave out --end")
     if wait:
         stand_by_for(profile, overrides or ())
         return
     raise typer.Exit(secure_profile(profile, overrides or (), end=end))
 
 
-@app.command(short_help="Test every device of a profile: the first command of the day.")
+@app.command(short_help="Test every device of a profile, as first command of the day.")
 def devices(
     profile: ProfileArgument,
     dry_run: DryRun = None,
@@ -606,7 +602,7 @@ def first_contact(
     role: Annotated[
         str,
         typer.Argument(
-            metavar="ROLE", help="The device, such as mobile_tweezers; default: every device in turn."
+            metavar="ROLE", help="The device, such as mobile_tweezers. Default: every device in turn."
         ),
     ] = "",
     steps: Annotated[
@@ -614,7 +610,7 @@ def first_contact(
         typer.Option(
             "--step",
             metavar="NAME",
-            help="Take only this step, and keep the earlier results of the others; may be repeated.",
+            help="Take only this step, and keep the earlier results of the others. May be repeated.",
         ),
     ] = None,
     instruments: Annotated[
@@ -622,12 +618,11 @@ def first_contact(
         typer.Option(
             "--with",
             metavar="scope|reference",
-            help="What is connected, instead of being asked: an oscilloscope, a 10 MHz reference; may be "
-            "repeated.",
+            help="A connected instrument, which labseq then need not ask about. May be repeated.",
         ),
     ] = None,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Do not ask before each step; readings are still asked for.")
+        bool, typer.Option("--yes", help="Do not ask before each step. Readings are still asked for.")
     ] = False,
     output: Output = None,
     dry_run: DryRun = None,
@@ -636,7 +631,7 @@ def first_contact(
 ) -> None:
     """Measure what the driver of a device assumes, step by step, and write a file with the verdict.
 
-    It asks before each step, which says what the outputs do; the device is made safe after each of them.
+    labseq asks before each step, says what the outputs will do, and makes the device safe after the step.
     Amplifiers must not be connected.
     """
     from labseq.cli.first_contact import Wanted, meet
@@ -658,19 +653,19 @@ def leader_test(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Copy of leader.token from that computer; default: the one in this computer's state folder.",
+            help="leader.token from that computer. Default: the one in this computer's state folder.",
         ),
     ] = None,
     shots: Annotated[
         int | None,
-        whole_number_option("Also take N shots of the run, at least 3. They move atoms, and they count."),
+        whole_number_option("Also take N shots of the run, at least 3. They move atoms and count."),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Lead a run in place of the control system, rightly and wrongly, and measure how fast it answers.
+    """Lead a run in place of the control system, correctly and with errors, and time its answers.
 
-    It tries wrong tokens, rubbish, lines that are too long, slow and closed connections and two leaders, and
-    prints a histogram of the times to an answer. Without --shots it takes no shot. The control system must
+    It tries wrong tokens, garbage, lines that are too long, slow and closed connections, and two leaders. It
+    prints a histogram of the response times. Without --shots it takes no shot. The control system must
     not be connected meanwhile.
     """
     from labseq.cli.leader_test import MIN_SHOTS, play_leader

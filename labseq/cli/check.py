@@ -1,4 +1,4 @@
-"""`labseq check`: prints what `session.check` has found: timeline, limits, warnings, and all errors."""
+"""`labseq check`: prints the timeline, limits, warnings and all errors that `session.check` has found."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Timeline = Sequence[tuple[str, Sequence[TimelineEntry]]]
 
 
 def timeline_table(timeline: Timeline, block: str, width: int = BAR_WIDTH) -> list[str]:
-    """A row per bar of the timeline: step, start, length, and the bar itself; no bars if the width is 0."""
+    """A row per bar of the timeline, with step, start, length and bar. No bars if the width is 0."""
     total_s = sum(bar.duration_s for _, bars in timeline for bar in bars)
     rows = [("step", "", "start", "at most", "timed by", "")]
     start_s = 0.0
@@ -67,7 +67,7 @@ def _bar(start_s: float, duration_s: float, total_s: float, block: str, width: i
 def lines_table(
     lines: Mapping[str, Sequence[tuple[float, float]]], total_s: float, block: str, width: int = BAR_WIDTH
 ) -> list[str]:
-    """A row per line: the time that it is on, and a bar that shows when; ``lines`` has (start, end) in s."""
+    """A row per line, with the time that it is on and a bar. ``lines`` has (start, end) in s."""
     if not lines:
         return []
     rows = [("line", "", "times on", "at most", "")]
@@ -85,7 +85,7 @@ _THEN = {"repeat_shot": "repeats the shot", "skip_point": "skips its point", "st
 
 
 def policy_texts(assembly: Assembly) -> list[str]:
-    """The policies that differ from the defaults: a line for the run, each step and each check."""
+    """A line per policy that differs from the default, of the run, a step or a check."""
     policy, spec = assembly.policy, assembly.sequence
     texts = [text for text in [_differing(policy.otherwise, StepPolicy(over_budget="record"))] if text]
     if policy.when_exhausted == "skip_point":
@@ -160,12 +160,12 @@ class CheckedSequence:
     """What a sequence does, for a scan at its first point.
 
     Attributes:
-        about: Name and text of what the run is made of: sequence, profile, planner, ...
-        limits: The same of what limits it: windows, attempts, policies, timeouts.
+        about: Name and text of the sequence, profile, planner, ...
+        limits: Name and text of each limit, such as windows, attempts, policies and timeouts.
         shot_s: Shortest and longest duration of a shot.
-        run_s: The same of the run.
+        run_s: Shortest and longest duration of the run.
         lines: Name of each line -> when it is on in the longest shot, as (start, end) in seconds.
-        idle_outputs: Name of each device that puts out something when nothing plays -> what.
+        idle_outputs: Name of each device with an output while nothing plays -> that output.
     """
 
     about: Facts
@@ -189,7 +189,7 @@ class CheckedSequence:
 
     @classmethod
     def of(cls, assembly: Assembly, checked: CheckReport, better: str = "") -> CheckedSequence:
-        """What the check of a sequence found."""
+        """The report of a checked sequence."""
         return cls(
             about=[*_subject(assembly, checked.planner_choice), *_expected(assembly, checked, better)],
             timeline=[TimelineStep(i, name, bars) for i, (name, bars) in enumerate(checked.timeline)],
@@ -216,7 +216,7 @@ class CheckedSequence:
         )
 
     def as_text(self) -> list[str]:
-        """What it is made of, timelines of steps and lines, durations and limits."""
+        """Parts of the run, timelines of steps and lines, durations and limits."""
         block = "█" if encodes(sys.stdout.encoding, "█") else "#"
         timeline = [(step.name, step.bars) for step in self.timeline]
         text_width = 2 + max(map(len, timeline_table(timeline, block, 0)))
@@ -257,7 +257,7 @@ class CheckedSequence:
 def check_sequence(
     sequence: Path, profile: str | None, overrides: Sequence[str], dry_run: DryRun, *, as_json: bool
 ) -> None:
-    """Check a sequence, and print its timeline, limits and errors; no device is opened."""
+    """Check a sequence, and print its timeline, limits and errors. No device is opened."""
     with reporting(as_json=as_json) as show:
         session = Session.open(
             sequence, profile=profile, overrides=overrides, dry_run=dry_run, observer=LogLines(sys.stderr)
@@ -295,7 +295,7 @@ def _subject(assembly: Assembly, planner_choice: Sequence[str]) -> Facts:
 
 
 def _expected(assembly: Assembly, checked: CheckReport, better: str) -> Facts:
-    """A planner that is expected to do better; and what of the expectations is not known of this machine."""
+    """A planner that is expected to do better, and expectations that use the paper's values."""
     if not better and not checked.planner_choice:
         return []
     given = assembly.hardware.document.get(("mobile_tweezers", "losses")) or {}
@@ -304,7 +304,7 @@ def _expected(assembly: Assembly, checked: CheckReport, better: str) -> Facts:
         for name in LossSpec.__dataclass_fields__
         if name.removesuffix("_s") not in given
     ]
-    losses = f"{', '.join(guessed)}: the paper's, as the profile does not give them"
+    losses = f"{', '.join(guessed)}as in the paper, because the profile does not give them"
     return [*([("better", better)] if better else []), *([("losses", losses)] if guessed else [])]
 
 
@@ -337,7 +337,7 @@ def _scanned(assembly: Assembly) -> list[str]:
     repeats = f", {plural(scan.repeats, 'shot')} of each" if scan.repeats > 1 else ""
     return [
         *lines,
-        f"{plural(scan.n_points, 'point')}{repeats}, {scan.order}; everything else here is for the first one",
+        f"{plural(scan.n_points, 'point')}{repeats}, {scan.order} (this report is for the first one)",
     ]
 
 
@@ -351,7 +351,7 @@ def _chosen(search: Search) -> list[str]:
     repeats = f", {plural(scan.repeats, 'shot')} of each" if scan.repeats > 1 else ""
     what = f"points chosen during the run by {choice.use}, at most {scan.n_points}{repeats}"
     aim = f"{'lowest' if choice.maximise is None else 'highest'} {clean(choice.quantity)}"
-    return [*lines, f"{what}, for the {aim}; everything else here is for the values in the files"]
+    return [*lines, f"{what}, for the {aim} (this report is for the values in the files)"]
 
 
 def _ends(axis: Axis) -> str:
@@ -399,5 +399,5 @@ def _windows(resolved: Mapping[str, Any]) -> list[str]:
         each = "for the moves of each cycle" if len(values) == 1 else "for the moves of the cycles"
         is_early = settings["window_mode"] == "early"
         image = "follows the last batch" if is_early else "waits for the end of the window"
-        texts.append(f"{times} {each}, {plural(settings['cycles'], 'cycle')} at most; the image {image}")
+        texts.append(f"{times} {each}, {plural(settings['cycles'], 'cycle')} at most, and the image {image}")
     return texts

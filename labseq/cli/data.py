@@ -57,11 +57,11 @@ class Examination:
     """The damage in a folder.
 
     Attributes:
-        folder: The data folder or run that was examined.
+        folder: The examined data folder or run.
         dry_run: Whether nothing was changed.
         runs: Number of runs that were checked.
         shots: Number of their intact shots.
-        in_progress: Runs that are in progress, and were not checked.
+        in_progress: Runs in progress, which were not checked.
         in_use: Number of the intact shots that another program has open for writing.
         findings: The defects.
     """
@@ -132,7 +132,7 @@ def export_to(
             what = f"a campaign cannot be exported as '{visible(kind)}'"
             raise ConfigError(Problem(what, "--to", expected="netcdf"))
         if where:
-            what = "a campaign is exported with all its shots"
+            what = "a campaign can only be exported with all its shots"
             raise ConfigError(Problem(what, "--where", expected="one of its runs"))
         path = output or Path(f"{folder.resolve().name}.nc")
         check_export("netcdf", path, frames=frames, replace=replace)
@@ -179,11 +179,9 @@ def state_lines(run: Run) -> list[str]:
     """Notes for the user about a run that did not complete."""
     shots = f"{plural(len(run.shots), 'shot')} of {run.n_shots}"
     if run.status == "running":
-        return [f"the run is still in progress; exported are the {shots} taken so far"]
-    lines = (
-        [] if run.status == "complete" else [f"the run did not complete ({run.status}); exported are {shots}"]
-    )
+        return [f"the run is still in progress, so only the {shots} taken so far are exported"]
+    lines = [] if run.status == "complete" else [f"the run is {run.status}, so only {shots} are exported"]
     if run.n_damaged_lines:
         damaged = plural(run.n_damaged_lines, "line")
-        lines.append(f"{damaged} of the index cannot be read; see labseq doctor")
+        lines.append(f"{damaged} of the index cannot be read; run labseq doctor")
     return lines

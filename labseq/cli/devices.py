@@ -21,14 +21,14 @@ from labseq.safety.safe import make_profile_safe, stand_by
 
 @dataclass(frozen=True, slots=True)
 class Versions:
-    """The version of a library or firmware here, and those that the driver was tried with."""
+    """The installed version of a library or firmware, and the versions that the driver was tried with."""
 
     here: str
     tried: str
 
     @property
     def differs(self) -> bool:
-        """Whether the driver was tried, but not with the version here."""
+        """True if the driver was tried, but not with the installed version."""
         return bool(self.tried) and self.here not in self.tried.split(", ")
 
 
@@ -55,7 +55,7 @@ class DeviceRow:
 
     @classmethod
     def of(cls, device: CheckedDevice, plugin: str) -> DeviceRow:
-        """What was found of a device."""
+        """The row of a checked device."""
         return cls(
             name=device.name,
             plugin=plugin,
@@ -103,7 +103,7 @@ class Devices:
     """The devices of a profile.
 
     Attributes:
-        problems: Mistakes of the profile; none if its devices were opened.
+        problems: Mistakes in the profile. Empty if its devices were opened.
     """
 
     devices: Sequence[DeviceRow]
@@ -111,7 +111,7 @@ class Devices:
     problems: Sequence[Problem] = ()
 
     def as_text(self) -> list[str]:
-        """A row per device; below it one for each of their versions."""
+        """A row per device, then a row for each of their versions."""
         versions = [
             (device.name, what, clean(one.here) or "unknown", one.tried or "none", "differs" * one.differs)
             for device in self.devices
@@ -126,15 +126,15 @@ class Devices:
 
 
 def show_devices(profile: str, overrides: Sequence[str], dry_run: DryRun, *, as_json: bool) -> int:
-    """Check the devices of a profile, and print a table of them.
+    """Check the devices of a profile, and print a table.
 
     Returns:
-        The exit code: 0 if all devices work, 3 if one failed, else 2 if one could not be constructed.
+        The exit code: 0 if all devices work, 3 if a device failed, else 2 if one could not be constructed.
 
     Raises:
-        ConfigError: The profile has an error; no device was opened.
-        DeviceError: Another process uses the same devices; none was opened.
-        StopRequested: It was stopped by Ctrl-C or SIGTERM; the devices tested so far were printed.
+        ConfigError: The profile has an error. No device was opened.
+        DeviceError: Another process uses the same devices. None was opened.
+        StopRequested: Ctrl-C or SIGTERM stopped it. The devices tested so far were printed.
     """
     with reporting(as_json=as_json) as show:
         with announcing(report_compiling):
@@ -156,10 +156,10 @@ def exit_code(report: DevicesReport) -> int:
 
 
 def secure_profile(profile: str, overrides: Sequence[str], *, end: bool | None = None) -> int:
-    """Make a profile's devices safe; print a line for each.
+    """Make a profile's devices safe, and print a line for each.
 
     Args:
-        end: Whether to end a process that uses them first; None to ask in a terminal, and else to end it.
+        end: Whether to end a process that uses them first. None asks in a terminal, and otherwise ends it.
 
     Returns:
         The exit code: 0 if every device is safe and the profile has no error, 3 if a device
@@ -178,7 +178,7 @@ def secure_profile(profile: str, overrides: Sequence[str], *, end: bool | None =
 
 
 def _asks_to_end(text: str) -> bool:
-    """Whether to end the process that uses a device, as the user says; true without a terminal to ask in."""
+    """Ask whether to end the process that uses a device. True without a terminal to ask in."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         return True
     try:
@@ -189,12 +189,12 @@ def _asks_to_end(text: str) -> bool:
 
 
 def stand_by_for(profile: str, overrides: Sequence[str]) -> None:
-    """Stand by for a profile's devices until Ctrl-C; print what happens."""
+    """Stand by for a profile's devices until Ctrl-C, and print what happens."""
     stand_by(profile, overrides, _Lines(), say)
 
 
 class _Lines:
-    """Implements ``RunObserver`` with a line per device."""
+    """Implements ``RunObserver`` by printing a line per device."""
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
         if name == "safe_state":

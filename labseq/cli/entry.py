@@ -1,4 +1,4 @@
-"""The entry point of the command line: arguments, usage errors, and the exit code."""
+"""The entry point of the command line, with arguments, usage errors and the exit code."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     Raises:
         SystemExit: Always, with the exit code.
     """
-    # imports leave hardly any garbage: looking for it every 700 objects would take 50 ms
+    # imports leave hardly any garbage, and looking for it every 700 objects would take 50 ms
     gc.set_threshold(20_000, *gc.get_threshold()[1:])
     import typer
 
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _of_current_folder(error: BaseException) -> BaseException:
-    """The error; but if the current folder was deleted, which any relative path needs, one that says so."""
+    """The error, or a clearer one if the current folder was deleted, because any relative path needs it."""
     if isinstance(error, FileNotFoundError):
         try:
             os.getcwd()  # noqa: PTH109 - nothing but whether it exists
@@ -87,7 +87,7 @@ def arrange(arguments: Sequence[str]) -> list[str]:
 
 
 def _is_no_quantity(argument: str) -> bool:
-    """Whether an argument after ``--scan`` or ``--map`` is another option, or the run: a number or a path."""
+    """True if an argument after ``--scan`` or ``--map`` is another option, or a run's number or path."""
     if argument.startswith("-") or argument.isdecimal() or {"/", os.sep}.intersection(argument):
         return True
     from labseq.recording.folders import RUN_FILE  # takes 0.3 s with numpy, which the command needs anyway
@@ -112,7 +112,7 @@ def _report_usage(error: Any, arguments: Sequence[str]) -> int:
 
 
 def _in_own_words(error: Any) -> Any:
-    """The error of a value of the wrong type or beyond a limit, worded as that of a setting in a file."""
+    """The error of a value of the wrong type or beyond a limit, worded like errors of settings in files."""
     parameter, errors = getattr(error, "param", None), getattr(error.__cause__, "errors", None)
     if parameter is None or errors is None:
         return error
@@ -127,7 +127,7 @@ def _in_own_words(error: Any) -> Any:
 
 
 def _usage_json(error: Any) -> str:
-    """A usage error as the command's JSON; "" for commands whose ``--json`` names a file."""
+    """A usage error as the command's JSON, or "" for commands whose ``--json`` names a file."""
     problem = ConfigError(" ".join(str(error.format_message()).split()))
     command = error.ctx.info_name if error.ctx is not None else ""
     if command == "check":
@@ -157,7 +157,7 @@ def _end_process(code: Any) -> NoReturn:
         sys.exit(code)
     with suppress(RecordingError):
         threads = "a thread" if len(names) == 1 else f"{len(names)} threads"
-        text = f"warning: {threads} of a plugin did not end: {', '.join(names)}; ended with the process"
+        text = f"warning: {threads} of a plugin did not end and stopped with the process: {', '.join(names)}"
         say(text, stream=sys.stderr)
     discard_unwritten()
     os._exit(code if isinstance(code, int) else int(code is not None))

@@ -1,4 +1,4 @@
-"""`labseq first-contact`: the questions, the readings, the table of steps and the page."""
+"""`labseq first-contact`: asks, reads the answers, and prints the table of steps and the page."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class _Terminal:
     """Implements ``Dialogue`` with questions at the terminal.
 
     Args:
-        instruments: Those that are connected; with ``asks``, the user is asked for the others.
+        instruments: Connected instruments. With ``asks``, the user is asked about the others.
         asks: Whether to ask before each step.
     """
 
@@ -69,9 +69,9 @@ class _Terminal:
         self._asks = asks
 
     def may_take(self, device: str, step: ContactStep, stop: StopFlag) -> bool:
-        """Ask for the instrument once, and before each step."""
+        """Ask before each step, and once for its instrument."""
         if step.needs and not self._has(step.needs, stop):
-            say(f"{device}  {step.name:<16} left out: it needs {INSTRUMENTS[step.needs]}")
+            say(f"{device}  {step.name:<16} left out, because it needs {INSTRUMENTS[step.needs]}")
             return False
         say(f"{device}  {step.name}: {step.does}")
         if step.prepare:
@@ -87,7 +87,7 @@ class _Terminal:
     def reads(self, reading: Reading, stop: StopFlag) -> float | None:
         """Ask for a reading until it makes sense."""
         example = EXAMPLES[reading.dimension] if reading.dimension != "fraction" else "12"
-        while text := _answer(f"  read {reading.about} (such as {example}; empty: not read): ", stop):
+        while text := _answer(f"  read {reading.about} (such as {example}, or nothing if not read):  ", stop):
             try:
                 value = parse_quantity(text, reading.dimension)
             except ValueError as error:
@@ -96,20 +96,20 @@ class _Terminal:
             if reading.low <= value <= reading.high:
                 return value
             low, high = (_quantity(limit, reading.dimension) for limit in (reading.low, reading.high))
-            say(f"  {text} makes no sense here; expected {low} to {high}")
+            say(f"  {text} is out of range; expected {low} to {high}")
         return None
 
     def ended(self, result: Mapping[str, Any]) -> None:
-        """Say how it ended."""
+        """Print how the step ended."""
         if "failed" in result:
             say(f"  FAILED: {result['failed']}")
         elif "skipped" in result:
             say(f"  nothing to measure: {result['skipped']}")
         else:
-            say("  done; the outputs are off")
+            say("  done, the outputs are off")
 
     def written(self, contact: Contact) -> None:
-        """Write the page, and say where it is and what follows."""
+        """Write the page, and print its path and the next command."""
         page = contact.path.with_suffix(".md")
         write_text(page, page_text(contact))
         say("", *_summary(contact, page))
@@ -120,7 +120,7 @@ def _quantity(value: float, dimension: str) -> str:
 
 
 def _answer(question: str, stop: StopFlag) -> str:
-    """What the user types. A request to stop ends the wait, which ``input`` alone would not obey.
+    """The user's answer. A request to stop ends the wait, which ``input`` alone would not obey.
 
     Raises:
         ConfigError: The user cannot answer, because stdin is closed.
@@ -135,11 +135,11 @@ def _answer(question: str, stop: StopFlag) -> str:
         while reader.is_alive():
             stop.wait(0.05)
     except StopRequested:
-        say("")  # the next line does not begin behind the question
+        say("")  # so that the next line does not begin behind the question
         raise
     if not lines or not lines[0]:
-        say("")  # nor does the error
-        hint = "give --yes, and --with for instruments; what they show is typed at a terminal"
+        say("")  # the same for the error
+        hint = "give --yes, and --with for instruments, or use a terminal to type their readings"
         raise ConfigError(f"there is no terminal that could answer; {hint}")
     return lines[0].strip()
 
@@ -179,7 +179,7 @@ def page_text(contact: Contact) -> str:
         lines += ["", f"## {step}", "", *_table(_rows(result, contact.units))]
     lines += [
         "",
-        f"The file beside this page, `{contact.path.name}`, has all digits, in SI units. labseq reads it.",
+        f"labseq reads `{contact.path.name}` in the same folder, which has all digits, in SI units.",
     ]
     return "\n".join([*lines, "It has a digest, and must not be edited.", ""])
 
@@ -204,7 +204,7 @@ def _rows(
 
 
 def _cell(value: Any, units: Sequence[str]) -> str:
-    """A result in the units of its columns; a list is one line of a table, or several."""
+    """A result in the units of its columns. A list becomes one or several lines of a table."""
     if isinstance(value, list):
         items: list[Any] = value
         by_column = len(items) == len(units) > 1 and not isinstance(items[0], list)
@@ -240,4 +240,4 @@ _UNITS: Final[Mapping[str, Callable[[float], str]]] = {
     "bytes": _size,
     "bits": "{:#x}".format,
 }
-"""How the page writes numbers, by the end of their names; an end that contains another one comes first."""
+"""How the page writes numbers, by the suffix of their names. Longer suffixes come first."""

@@ -1,4 +1,4 @@
-"""`labseq leader-test`: plays the control system that leads a run, rightly and wrongly."""
+"""`labseq leader-test`: leads a run like a control system, both correctly and with errors."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from labseq.console.text import plural, time_text
 from labseq.errors import ConfigError, DeviceError
 
 N_QUESTIONS: Final = 200
-"""Times that it asks for the state, to measure the connection without a shot."""
+"""Number of requests for the state, to time the connection without a shot."""
 N_CHECKED: Final = 2
-"""Shots that are led badly."""
+"""Number of shots that are led with errors."""
 MIN_SHOTS: Final = N_CHECKED + 1
 MAX_WAIT_S: Final = 5.0
 """Longest time for an answer that does not need a shot."""
@@ -31,10 +31,10 @@ Connection = TypeVar("Connection")
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """Where the run listens.
+    """Address and token of a run that waits for a leader.
 
     Attributes:
-        token: Text of its file `leader.token`.
+        token: Content of the run's file `leader.token`.
     """
 
     host: str
@@ -43,11 +43,11 @@ class Contact:
 
     @property
     def hello(self) -> bytes:
-        """The first line of a control system."""
+        """The first line that a control system sends."""
         return f"hello {self.token} version={VERSION}\n".encode()
 
     def leader(self) -> Leader:
-        """Lead as a control system does that uses the client."""
+        """Lead with the client, like a control system."""
         return _once_free(lambda: Leader(self.host, self.port, self.token))
 
     def peer(self, *begin: bytes, pause_s: float = 0.0) -> Peer:
@@ -85,7 +85,7 @@ def _once_free(lead: Callable[[], Connection]) -> Connection:
 
 
 class Peer:
-    """A connection that may send anything; closes at the end of a `with` block."""
+    """A connection that may send anything. Closes at the end of a `with` block."""
 
     def __init__(self, link: socket.socket) -> None:
         self._link = link
@@ -96,13 +96,13 @@ class Peer:
         self._link.sendall(data)
 
     def hear(self, more_s: float = 0.0) -> str:
-        """The next line; "closed" if the connection was closed, "no answer" if none came in time."""
+        """The next line, "closed" if the connection was closed, or "no answer" if none came in time."""
         self._link.settimeout(MAX_WAIT_S + more_s)
         try:
             line = self._lines.readline()
         except ConnectionError:
             line = b""
-        except OSError:  # it took too long, now or before
+        except OSError:  # a timeout, in this call or an earlier one
             return "no answer"
         return line.decode("ascii", "backslashreplace").strip() if line else "closed"
 
@@ -112,7 +112,7 @@ class Peer:
         return self.hear()
 
     def await_waiting(self, more_s: float) -> str:
-        """The state of the run, once it waits for `go` or none of its shots can be in progress."""
+        """Wait until the run waits for `go` or no shot can be in progress, and return its state."""
         end_s = time.monotonic() + MAX_WAIT_S + more_s
         while (state := self.ask(b"state?")) in ("state busy", "state idle") and time.monotonic() < end_s:
             time.sleep(0.02)
@@ -134,11 +134,11 @@ class Peer:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """What the run answered to something that it must refuse or survive.
+    """A test case that the run must refuse or survive, with the run's answers.
 
     Attributes:
         expected: How its answers must begin.
-        came: Its answers.
+        came: The actual answers.
     """
 
     name: str
@@ -148,7 +148,7 @@ class Check:
 
     @classmethod
     def of(cls, name: str, expected: Sequence[str], came: Sequence[str]) -> Check:
-        """Compare answers with what was expected of them."""
+        """Compare answers with the expected beginnings."""
         pairs = zip(came, expected, strict=True)
         return cls(name, all(answer.startswith(begin) for answer, begin in pairs), expected, came)
 
@@ -162,7 +162,7 @@ CHECKS: Final[Sequence[Column[Check]]] = (
 
 @dataclass(frozen=True, slots=True)
 class LeaderReport:
-    """How a run answers the control system that leads it; times in seconds.
+    """The answers of a run to its leading control system, with times in seconds.
 
     Attributes:
         deadline_s: Longest time from `go` to the end of a shot.
@@ -189,12 +189,12 @@ class LeaderReport:
                 lines += ["", *histogram(name, times)]
         lines += [f"a shot failed: {reason}" for reason in self.failed]
         if not self.end_s:
-            lines += ["", "no shot was taken; --shots N takes N shots of the run and measures its answers"]
+            lines += ["", "no shot was taken; give --shots N to take N shots and time their answers"]
         return lines
 
 
 def histogram(name: str, times_s: Sequence[float], n_bins: int = 8) -> list[str]:
-    """Draw how often an answer took how long; the bins grow by a constant factor.
+    """Draw a histogram of response times, with bins that grow by a constant factor.
 
     Example:
         >>> for line in histogram("state?", [0.001, 0.001, 0.002], n_bins=2):
@@ -226,10 +226,10 @@ def _quantile(ordered: Sequence[float], share: float) -> float:
 
 
 def play_leader(host: str, port: int, token_file: Path | None, shots: int, *, as_json: bool) -> int:
-    """Play the control system, and print a report.
+    """Lead a run like a control system, and print a report.
 
     Args:
-        shots: Shots to take; 0 to take none.
+        shots: Number of shots to take, also 0.
 
     Returns:
         The exit code: 0 if the run answered as it must and no shot failed, else 3.
@@ -254,9 +254,9 @@ def _token(file: Path | None) -> str:
     try:
         return labseq_client.own_token() if file is None else file.read_text("ascii").strip()
     except (OSError, UnicodeError) as error:
-        text = f"the token cannot be read: {error}"
+        text = f"the leader's token cannot be read: {error}"
         raise ConfigError(
-            f"{text}; copy leader.token of labseq's computer, and name it with --token"
+            f"{text}; copy leader.token from labseq's computer, and give its path with --token"
         ) from error
 
 
@@ -287,10 +287,10 @@ def _timed(call: Callable[[], object]) -> float:
 
 
 def _newcomers(contact: Contact) -> list[Check]:
-    """Connections that must be refused, each with what it sends first."""
+    """Check connections that must be refused because of their first bytes."""
     firsts = (
         ("a wrong token", b"hello " + b"0" * len(contact.token) + b"\n", [NO_TOKEN, "closed"]),
-        ("rubbish instead of a token", bytes(range(128, 256)) + b"\n", [NO_TOKEN, "closed"]),
+        ("garbage instead of a token", bytes(range(128, 256)) + b"\n", [NO_TOKEN, "closed"]),
         ("the request of a web page", b"POST / HTTP/1.1\r\nHost: labseq\r\n\r\n", [NO_TOKEN, "closed"]),
         ("a first line without end", b"x" * 300, [NO_TOKEN, "closed"]),
         ("another version", f"hello {contact.token} version=999\n".encode(), ["error version is", "closed"]),
@@ -304,7 +304,7 @@ def _newcomers(contact: Contact) -> list[Check]:
 
 
 def _as_leader(contact: Contact, deadline_s: float) -> list[Check]:
-    """What it must refuse while it is led, and survive; none of it begins a shot."""
+    """Check errors that the run must refuse or survive while it is led. None of them begins a shot."""
     with contact.peer(contact.hello[:8], contact.hello[8:20], contact.hello[20:], pause_s=0.2) as slow:
         checks = [Check.of("a slow connection", ["hello"], [slow.hear()])]
         with contact.peer(contact.hello) as second:
@@ -321,7 +321,7 @@ def _as_leader(contact: Contact, deadline_s: float) -> list[Check]:
 
 
 def _in_shots(contact: Contact, deadline_s: float) -> list[Check]:
-    """Two shots that are led badly."""
+    """Check two shots that are led with errors."""
     with contact.leading_peer() as leader:
         came = [leader.ask(b"go leader-test"), leader.ask(b"go too early"), leader.hear(deadline_s)]
         end = "failed shot" if came[-1].startswith("failed shot") else "ready"

@@ -1,4 +1,4 @@
-"""The live view of a run in the terminal: its events are added up to numbers, and these are drawn."""
+"""The live view of a run in the terminal, which adds up the run's events and draws the results."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ def observer_for(stream: TextIO, run_now: Callable[[], float] | None = None) -> 
 class LiveView:
     """Implements ``RunObserver`` with a picture of the run that is redrawn in place.
 
-    In the process of a run it is drawn when events arrive, never from a thread, so never while a device is
-    being called; with real hardware only between shots, because atoms are lost while the run waits for the
-    terminal. `labseq watch` draws it by :meth:`refresh`, too.
+    In the process of a run, the view is drawn when events arrive and never from a thread, so never during a
+    device call. With real hardware it is drawn only between shots, because atoms are lost while the run waits
+    for the terminal. `labseq watch` also draws it by :meth:`refresh`.
 
     Args:
-        run_now: Clock of the run in seconds; by default ``now``.
+        run_now: Clock of the run in seconds. Default ``now``.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class LiveView:
             self._draw()
 
     def close(self) -> None:
-        """Draw a last time and release the terminal; may be called several times."""
+        """Draw a last time and release the terminal. May be called several times."""
         if self._live.is_started:
             try:
                 self._draw()
@@ -114,7 +114,7 @@ class LiveView:
 
 
 STAGES: Final = ("arm", "expose", "read_out", "detect", "plan", "check", "prepare", "play", "move", "write")
-"""The stages that are shown, in order; a shot may have others."""
+"""The stages that are shown, in order. A shot may have others."""
 
 
 _KEPT: Final = 200
@@ -128,8 +128,8 @@ class StageTally:
     Attributes:
         host_s: The latest durations, on this computer's clock.
         duration_s: The latest durations, on the session's clock.
-        budget_s: The latest budget; nan if it has none.
-        n_over: Number of times that it exceeded its budget.
+        budget_s: The latest budget, or nan without one.
+        n_over: Number of durations above the budget.
     """
 
     host_s: deque[float] = field(default_factory=lambda: deque[float](maxlen=_KEPT))
@@ -149,7 +149,7 @@ class StageTally:
         return statistics.median(self.host_s), statistics.median(self.duration_s)
 
     def p99_s(self) -> float:
-        """The 99th percentile on this computer's clock: the second longest of 200."""
+        """The 99th percentile on this computer's clock, which is the second longest of 200."""
         longest = sorted(self.host_s)
         return longest[math.ceil(0.99 * len(longest)) - 1]
 
@@ -180,7 +180,7 @@ class ScanTally:
                 self.lines[self._scan["point_of_shot"][row.shot]].append(line)
 
     def points(self) -> list[tuple[str, list[int]]]:
-        """The value of each point as text, and its shots; sorted by value if one number is scanned."""
+        """The value of each point as text, and its shots. Sorted by value if one number is scanned."""
         chosen = self._chosen
         written: list[list[str]] = self._scan.get("written", []) if chosen is None else chosen.written
         values: list[list[Any]] = self._scan.get("points", []) if chosen is None else chosen.points
@@ -191,23 +191,23 @@ class ScanTally:
 
 
 class Tally:
-    """Sums up a run's events; unknown events are ignored.
+    """Sums up a run's events. Unknown events are ignored.
 
     Attributes:
         record: The run, from "run_starting" on.
         n_before: Number of shots that were complete before the first event.
-        n_done: Number of shots completed since then.
-        n_judged: Number of them that were judged on their last image.
-        n_defect_free: Number of them that met the target.
-        n_seen: Number of them that met it in at least one image.
+        n_done: Number of shots completed since the first event.
+        n_judged: Number of completed shots that were judged on their last image.
+        n_defect_free: Number of judged shots that met the target.
+        n_seen: Number of judged shots that met the target in at least one image.
         n_repeated: Number of attempts that had to be repeated.
         image: The last image.
         image_shot: Index of the shot of the last image.
         shot: Index of the current shot.
         stages: Stage -> its durations.
-        scan: The points of the scan; None without one.
+        scan: The points of the scan, or None.
         measured: The quantities that the run measures, the most important first.
-        fits: Their fits against the scanned value; None without a scan.
+        fits: Fits of these quantities against the scanned value. None without a scan.
         best: The best point of an adaptive scan so far, as text, or "".
         status: Final status of the run, or "".
     """
@@ -233,7 +233,7 @@ class Tally:
 
     @property
     def time_left_s(self) -> float:
-        """Expected time to the end of the run, from the shots so far; nan before the first complete shot."""
+        """Expected time to the end of the run, from the shots so far. nan before the first complete shot."""
         if not self.n_done:
             return math.nan
         return (self._now() - self._first_shot_s) / self.n_done * (self.n_shots - self.n_before - self.n_done)
@@ -266,7 +266,7 @@ class Tally:
 
     def _begin(self, record: RunRecord, run_dir: Path, n_before: int) -> None:
         self.record, self.status = record, ""
-        self.n_before = n_before - self.n_done  # `watch` has counted them itself
+        self.n_before = n_before - self.n_done  # `watch` has already counted the shots since then
         if self.scan is None and record.scan:  # the points of a resumed run are kept
             self.scan = ScanTally(record.scan)
         if not self.measured:
@@ -287,7 +287,7 @@ class Tally:
             measured.add(row)
 
     def look(self) -> None:
-        """Add the results of analyses that have come, and fit what has points."""
+        """Add new results of analyses, and fit the quantities that have points."""
         for measured in self.measured:
             measured.read_results()
         if self.fits is not None and self.scan is not None:
@@ -299,9 +299,9 @@ _GAP: Final = 3
 
 
 class Picture:
-    """The view as rich prints it: progress, array and numbers side by side, latest events.
+    """The view as rich prints it, with progress, array and numbers side by side, and the latest events.
 
-    Parts that do not fit are left out: the array is drawn smaller, then dropped, and then the
+    If there is no room, the array is drawn smaller, then dropped, and then the
     latest events are dropped.
     """
 
@@ -373,7 +373,7 @@ def _progress(tally: Tally, width: int) -> Table:
 
 
 def _array(tally: Tally, width: int, height: int, glyphs: Glyphs) -> list[Text]:
-    """The array of the last image as large as possible; empty if there is no room."""
+    """The array of the last image as large as possible, or empty if there is no room."""
     if tally.image is None or tally.record is None:
         return []
     occupancy, shear = tally.image.occupancy, shear_of(tally.record)
@@ -393,7 +393,7 @@ def shear_of(run: RunRecord) -> int:
 
 
 def _results(tally: Tally) -> Table:
-    """What the run measures; with a target, also whether it was met."""
+    """The measured quantities. With a target also the defect-free rate."""
     table = Table.grid(padding=(0, 2, 0, 0))
     table.add_column(style="bold", no_wrap=True)
     table.add_column(no_wrap=True)
@@ -419,7 +419,7 @@ def _results(tally: Tally) -> Table:
 
 
 def _stages(tally: Tally) -> Table:
-    """A row per stage; on real hardware the session's clock is that of this computer."""
+    """A row per stage. On real hardware the session's clock is this computer's clock."""
     simulated = tally.record is None or tally.record.simulated
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     table.add_column("stage", no_wrap=True)
@@ -501,7 +501,7 @@ def draw_scan(
 
 
 def _merged(points: Sequence[Sequence[int]], room: int) -> list[list[int]]:
-    """The shots of the points, with neighbours put together if there is no room for all."""
+    """The shots of the points. Neighbours are merged if there is no room for all."""
     n = min(len(points), max(1, room))
     ends = [round(i * len(points) / n) for i in range(n + 1)]
     return [list(chain.from_iterable(points[first:end])) for first, end in pairwise(ends)]
@@ -510,7 +510,7 @@ def _merged(points: Sequence[Sequence[int]], room: int) -> list[list[int]]:
 def _bars(
     values: Sequence[float | None], low: float, high: float, height: int, bar: int, glyphs: Glyphs
 ) -> list[str]:
-    """Vertical bars, a line of text per row, the highest first; the lowest value is still a thin line."""
+    """Vertical bars, a line of text per row, the highest first. The lowest value is still a thin line."""
     steps = len(glyphs.levels)
     filled = [0 if v is None else max(1, round((v - low) / (high - low) * height * steps)) for v in values]
     gap = " " if bar > 1 else ""

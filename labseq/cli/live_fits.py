@@ -20,19 +20,19 @@ from labseq.errors import RecordingError
 from labseq.recording.run_file import WRITTEN_UNITS
 
 PAUSE: Final = 100.0
-"""Minimum time between two fits, as a multiple of what the last one took: they delay shots by 1 % at most."""
+"""Minimum time between two fits, in durations of the last fit, so that fits delay shots by 1 % at most."""
 
 
 class LiveFits:
-    """The fitted parameters of what a run measures, as the live view shows them.
+    """The fitted parameters of the measured quantities, for the live view.
 
-    Only labseq's own models are fitted, in milliseconds: this is the process that takes the shots, and a
+    Only labseq's own models are fitted, in milliseconds, because this process takes the shots and a
     model of a plugin may hang. Adaptive scans and scans of several values are left to the summary.
 
     Args:
         run_dir: The run's folder.
         resolved: Its settings.
-        measured: The quantities that it measures.
+        measured: The quantities that the run measures.
 
     Attributes:
         results: Quantity -> name and value of the fitted parameter, for fits that have succeeded.
@@ -52,7 +52,7 @@ class LiveFits:
 
         Args:
             lines: Number of a point -> its shots, by their places in the series.
-            at_once: Do not wait for the end of the pause: the run is over.
+            at_once: Do not wait for the end of the pause, because the run is over.
         """
         n_shots = sum(map(len, lines.values()))
         is_early = time.monotonic() < self._next_s and not at_once
@@ -61,10 +61,10 @@ class LiveFits:
         began_s, self._n_fitted = time.monotonic(), n_shots
         try:
             self._fit(lines)
-        except RecordingError:  # run.json cannot be read: the summary tells why
+        except RecordingError:  # run.json cannot be read: the summary reports why
             self._series = []
         ended_s = time.monotonic()
-        # maximum time between two fits, in seconds: the first takes longer, as it loads what the others use
+        # maximum time between two fits, in seconds. The first fit takes longer, because it imports modules
         self._next_s = ended_s + min(PAUSE * (ended_s - began_s), 20.0)
 
     def _fit(self, lines: Mapping[int, Sequence[int]]) -> None:
@@ -84,7 +84,7 @@ class LiveFits:
 
 
 def _doubt(fit: Fit | None) -> str:
-    """What a value's error does not tell: that the points do not follow the model."""
+    """A warning that the points do not follow the model, which the error of the value does not show."""
     if fit is None or follows(fit) or math.isnan(fit.reduced_chi_square):
         return ""
     return f", chi-square {fit.reduced_chi_square:.2g}"

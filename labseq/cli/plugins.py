@@ -14,7 +14,7 @@ from labseq.plugins.host import PluginHost, PluginInfo
 
 @dataclass(frozen=True, slots=True)
 class PluginRow(PluginInfo):
-    """A plugin, and what it offers: "planner:psca"."""
+    """A plugin and its contributions, such as "planner:psca"."""
 
     offers: Sequence[str] = ()
 
@@ -30,13 +30,13 @@ PLUGINS: Final[Sequence[Column[PluginRow]]] = (
 
 @dataclass(frozen=True, slots=True)
 class Plugins:
-    """The plugins that were found."""
+    """All installed and local plugins."""
 
     plugins: Sequence[PluginRow]
 
     @classmethod
     def of(cls, host: PluginHost) -> Plugins:
-        """Those of a host, and those in ``./plugins`` that nothing names."""
+        """The plugins of a host, and the unused ones in ``./plugins``."""
         rows: list[PluginRow] = []
         for info in (*host.infos, *host.unused()):
             offers = [f"{kind}:{name}" for kind, name in host.registry.offers(info.name)]
@@ -44,7 +44,7 @@ class Plugins:
         return cls(rows)
 
     def as_text(self) -> list[str]:
-        """A row per plugin; below the table the reasons why plugins failed to load, and notes."""
+        """A row per plugin, then the reasons why plugins failed to load, and notes."""
         remarks: list[str] = []
         for plugin in self.plugins:
             remarks += [f"{plugin.name}: {plugin.reason}"] if plugin.reason else []
@@ -53,12 +53,12 @@ class Plugins:
 
 
 def list_plugins(profile: str | None, *, as_json: bool = False) -> None:
-    """Print a table of the plugins, those in the folders of a profile and those in ``./plugins`` included."""
+    """Print a table of the plugins, including those in a profile's folders and in ``./plugins``."""
     with reporting(as_json=as_json) as show:
         if profile is None:
             host = load_plugins()
         else:
-            from labseq.config.profile import load_profile  # takes a tenth of the command
+            from labseq.config.profile import load_profile  # takes a tenth of the command's time
 
             document, spec = load_profile(profile)  # the plugins that it names need not exist
             host = load_plugins(plugin_paths(document, spec.plugin_folders), max_wait_s=spec.timeouts.load_s)

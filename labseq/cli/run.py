@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def run_sequence(sequence: Path, options: Options, *, as_json: bool, web: bool = False) -> None:
-    """Run a sequence, with ``web`` also in a browser; print the result even if it was stopped or failed."""
+    """Run a sequence, and print the result even if the run was stopped or failed. ``web``: in a browser."""
     if web:
         from labseq.web.serve import start_for_run
 
@@ -47,7 +47,7 @@ def run_sequence(sequence: Path, options: Options, *, as_json: bool, web: bool =
 
 
 def resume_run(path: Path, options: Mapping[str, Any], *, as_json: bool) -> None:
-    """Take missing or further shots of a run, and print the result; see ``Session.resume``."""
+    """Take missing or further shots of a run, and print the result. See ``Session.resume``."""
 
     def resume(observer: RunObserver | None) -> Session:
         return Session.resume(folder_of_run(path), **options, observer=observer)
@@ -56,7 +56,7 @@ def resume_run(path: Path, options: Mapping[str, Any], *, as_json: bool) -> None
 
 
 def rerun_run(path: Path, options: Mapping[str, Any], *, as_json: bool) -> None:
-    """Take a run again, and print the result; the options are those of ``Session.rerun``."""
+    """Take a run again, and print the result. ``options`` as in ``Session.rerun``."""
 
     def rerun(observer: RunObserver | None) -> Session:
         return Session.rerun(folder_of_run(path), **options, observer=observer)
@@ -65,7 +65,7 @@ def rerun_run(path: Path, options: Mapping[str, Any], *, as_json: bool) -> None:
 
 
 def _observer() -> LogLines | LiveView:
-    """Shows the run on a terminal, or prints lines; only the former imports rich."""
+    """Shows the run on a terminal, or prints lines. Only the former imports rich."""
     if not sys.stdout.isatty():
         return LogLines(sys.stdout)
     from labseq.cli.live import observer_for
@@ -74,7 +74,7 @@ def _observer() -> LogLines | LiveView:
 
 
 def run_session(opening: Callable[[RunObserver | None], Session], *, as_json: bool) -> None:
-    """Run the session that ``opening`` opens with an observer; print the result even if the run failed."""
+    """Run the session that ``opening`` opens with an observer. Print the result even if the run failed."""
     answer = stdout_to_stderr() if as_json else None
     observer = _observer()
     session: Session | None = None
@@ -102,12 +102,12 @@ def calibrate_for_queue(kind: str, profile: str, dry_run: DryRun) -> None:
 
 
 def try_notice(text: str) -> None:
-    """Send a notice by every way that ``notify.yaml`` names.
+    """Send a notice in every way that ``notify.yaml`` names.
 
     Raises:
-        ConfigError: There is no such file, it has an error, or a way failed.
+        ConfigError: There is no such file, it has an error, or a notice could not be sent.
     """
-    from labseq.session.notices import Notices  # what other commands do not need
+    from labseq.session.notices import Notices  # other commands do not need it
     from labseq.session.send_notice import send
 
     path = data_root() / NOTIFY_FILE
@@ -123,7 +123,7 @@ def try_notice(text: str) -> None:
 def _print_result(
     run_dir: Path | None, failure: BaseException | None, answer: Callable[[str], None] | None
 ) -> None:
-    """Print the summary of a run, if it was created; and its JSON by ``answer``."""
+    """Print the summary of a run, if it was created, and its JSON by ``answer``."""
     run = _read_back(run_dir)
     if run is None and answer is None:
         return
@@ -138,13 +138,13 @@ def _print_result(
 
 
 def _report(summary: Summary) -> None:
-    """Print the summary; an error of stdout, such as a full disk, does not affect the run."""
+    """Print the summary. An error of stdout, such as a full disk, does not affect the run."""
     lines = summary.as_text()
     try:
         say(*lines)
     except RecordingError as error:
         with suppress(RecordingError):
-            say(f"warning: {error}; the run is not affected", *lines, stream=sys.stderr)
+            say(f"warning: {error} (the run is not affected)", *lines, stream=sys.stderr)
 
 
 def _read_back(run_dir: Path | None) -> Run | None:
@@ -164,7 +164,7 @@ def stop_run(run: Path | None, profile: str | None, *, queue: bool, wait: bool) 
     """Ask a run in progress to end after its current shot, and print a confirmation."""
     if queue:
         if not Queue(data_root()).ask_to_stop():
-            raise ConfigError("no process runs the queue; 'labseq stop' without --queue ends a run")
+            raise ConfigError("no process runs the queue; to end a run use 'labseq stop' without --queue")
         say("the queue starts no further runs")
         if run is None and not running_here(profile):
             return
@@ -186,7 +186,7 @@ SHOTS: Final = 10
 def run_demo(shots: int | None, output: Path | None) -> None:
     """Run a packaged sequence on the packaged virtual profile, and explain it before and after."""
     opened: list[Session] = []
-    profile = str(packaged_profiles_dir() / f"{PROFILE}.yaml")  # not one of this name in the current folder
+    profile = str(packaged_profiles_dir() / f"{PROFILE}.yaml")  # not from the current folder
     options = Options(profile, SHOTS if shots is None else shots, output=output)
 
     def start(observer: RunObserver | None) -> Session:
@@ -209,7 +209,7 @@ def beginning(session: Session) -> list[str]:
     rows, cols = (int(target.any(axis=axis).sum()) for axis in (1, 0))
     grid_is, shots = f"{grid.n_rows} x {grid.n_cols}", plural(assembly.sequence.shots, "shot")
     return [
-        f"This is {SEQUENCE}, a sequence that comes with labseq, on simulated hardware: no device is used.",
+        f"This is {SEQUENCE}, a sequence that comes with labseq, on simulated hardware. No device is used.",
         f"Each of {shots} loads atoms at random into {grid_is} tweezers, takes an image, rearranges",
         f"the atoms into an array of {rows} x {cols} in up to {cycles} cycles of plan, check, move, image,",
         "and takes the image that decides its success. The first time, labseq compiles its kernels.",
@@ -223,7 +223,7 @@ def ending(run_dir: Path) -> list[str]:
     has_matplotlib = importlib.util.find_spec("matplotlib") is not None
     needs = "" if has_matplotlib else f"; first: {install_hint('plot')}"
     rows = [
-        (f"  labseq show {run}", "these numbers again; --shots and --timing print more"),
+        (f"  labseq show {run}", "these numbers again (more with --shots and --timing)"),
         (f"  labseq plot {run}", f"the run as a picture{needs}"),
         (f"  labseq check {SEQUENCE}", "what a shot does, step by step"),
         (f"  labseq run {SEQUENCE} --set planner.degree_of_parallelism=15", "with one value changed"),
@@ -237,15 +237,15 @@ def ending(run_dir: Path) -> list[str]:
 
 
 def copy_files(folder: Path) -> None:
-    """Copy the packaged sequences and profiles to a folder, for the user to change; no file is replaced.
+    """Copy the packaged sequences and profiles to a folder, for the user to change. No file is replaced.
 
     Raises:
-        ConfigError: One of the files exists already, and none was copied; or one cannot be written.
+        ConfigError: One of the files exists already, and none was copied. Or one cannot be written.
     """
     copies = list(_copies(folder))
     if taken := [new for _, new in copies if new.exists()]:
         more = f" (and {plural(len(taken) - 1, 'more file')})" if len(taken) > 1 else ""
-        what = f"this file already exists{more}; nothing was copied"
+        what = f"nothing was copied, because this file already exists{more}"
         raise ConfigError(Problem(what, visible(str(taken[0])), expected="a folder without them"))
     for old, new in copies:
         try:
@@ -259,7 +259,7 @@ def copy_files(folder: Path) -> None:
         f"{plural(len(copies), 'file')} copied to sequences and hardware_profiles in {visible(str(folder))}.",
         "To run the copies, change to that folder:",
         f"  labseq run sequences/{SEQUENCE}.yaml",
-        "There, 'profile: virtual' means the copy in ./hardware_profiles.",
+        "There, the profile 'virtual' is the copy in ./hardware_profiles.",
     )
 
 

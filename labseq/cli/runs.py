@@ -1,4 +1,4 @@
-"""`labseq runs` and `labseq note`: the runs in a data folder, and what people say about them."""
+"""`labseq runs` and `labseq note`: list the runs in a data folder, and write notes about them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from labseq.recording.notes import Notes, read_notes, write_notes
 
 @dataclass(frozen=True, slots=True)
 class RunQuery:
-    """Which runs are listed; see :func:`labseq.data.catalogue.runs`.
+    """The conditions for a list of runs, see :func:`labseq.data.catalogue.runs`.
 
     Attributes:
         conditions: Arguments of that function.
-        sort: Name of the result or other value that they are sorted by, with "-" before it from the
-            greatest to the least; "" for the time.
+        sort: Name of the result or other value to sort by, with "-" before it from the
+            greatest to the least. "" sorts by time.
         limit: Maximum number of runs.
     """
 
@@ -52,7 +52,7 @@ COLUMNS: Final[Sequence[Column[RunEntry]]] = (
 
 
 def _note(run: RunEntry) -> str:
-    """Tags and note; of a run that has failed also why, without the name of the error."""
+    """Tags and note. Of a failed run also the reason, without the name of the error."""
     why = "(" + re.sub(r"^[A-Z]\w*: ", "", run.error) + ")" if run.status == "failed" else ""
     return " ".join(text for text in (*(f"[{tag}]" for tag in run.tags), run.note, why) if text)
 
@@ -63,12 +63,12 @@ def _shots(run: RunEntry) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RunList:
-    """The runs in a data folder that were asked for, in the order in which they are printed.
+    """The requested runs of a data folder, in the order in which they are printed.
 
     Attributes:
         folder: The data folder.
         runs: The runs.
-        has_more: Whether there are others, which the limit has left out.
+        has_more: Whether the limit has left out other runs.
     """
 
     folder: Path
@@ -76,7 +76,7 @@ class RunList:
     has_more: bool
 
     def as_json(self) -> dict[str, Any]:
-        """The runs with what names them."""
+        """The runs with their names."""
         listed = [
             {
                 "run": run.id,
@@ -94,8 +94,8 @@ class RunList:
             return [f"no such runs in {visible(str(self.folder))}"]
         lines = table(self.runs, COLUMNS)
         if n_damaged := sum(run.status == "damaged" for run in self.runs):
-            lines += ["", f"{plural(n_damaged, 'run')} cannot be read: `labseq doctor` says why"]
-        return [*lines, *(["", "there are more; --limit N lists N"] if self.has_more else [])]
+            lines += ["", f"{plural(n_damaged, 'run')} cannot be read; `labseq doctor` says why"]
+        return [*lines, *(["", "there are more runs; give --limit N to list N"] if self.has_more else [])]
 
 
 def _plain(result: Any) -> dict[str, Any]:
@@ -103,7 +103,7 @@ def _plain(result: Any) -> dict[str, Any]:
 
 
 def list_runs(data: Path | None, query: RunQuery, *, as_json: bool) -> None:
-    """Print a row for each of the newest runs that meet the conditions, the newest last; or sorted.
+    """Print a row for each of the newest runs that meet the conditions, the newest last or sorted.
 
     Raises:
         ConfigError: There is no such folder, a condition cannot be read, or no run has the value to sort by.
@@ -116,7 +116,7 @@ def list_runs(data: Path | None, query: RunQuery, *, as_json: bool) -> None:
 
 
 def sorted_by(name: str, found: Sequence[RunEntry]) -> list[RunEntry]:
-    """The runs that have a value, the greatest first; the least first if its name begins with "-".
+    """The runs that have a value, the greatest first, or the least first if its name begins with "-".
 
     Raises:
         ConfigError: None has it.
@@ -136,7 +136,7 @@ def _is_number(value: Any) -> TypeGuard[float]:
 
 
 def _local_time(t_utc: str) -> str:
-    """The time of day on this computer; the run's name has the date."""
+    """The time of day on this computer. The run's name has the date."""
     try:
         return f"{datetime.fromisoformat(t_utc).astimezone():%H:%M}"
     except (ValueError, OverflowError):
@@ -144,7 +144,7 @@ def _local_time(t_utc: str) -> str:
 
 
 def write_note(path: Path, text: str | None, tags: Sequence[str], untag: Sequence[str]) -> None:
-    """Replace the note of a run unless it is None, add and remove tags, and print what it then has.
+    """Replace the note of a run unless it is None, add and remove tags, and print the new note and tags.
 
     Raises:
         ConfigError: There is no such run, it has no such tag, or a text is too long.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """The tables to print; the summary if none is chosen."""
+    """The tables to print. Without any, the summary is printed."""
 
     shots: bool = False
     timing: bool = False
@@ -46,7 +46,7 @@ class Tables:
 def show_run(
     path: Path | None, *, as_json: bool, tables: Tables | None = None, where: Sequence[str] | None = None
 ) -> None:
-    """Print the summary or tables of a run, by default the newest, or of those shots that meet conditions."""
+    """Print the summary or tables of a run, by default the newest, or of its shots that meet conditions."""
     wanted = tables or Tables()
     try:
         run = chosen_run(path, where)
@@ -67,7 +67,7 @@ class ShotRow:
     Attributes:
         scanned: Address -> scanned value, in the units of the sequence.
         outcome: The result in words.
-        measured: Quantity that the run measures -> its value, SI; those with words of their own left out.
+        measured: Measured quantity -> its value, SI, without the quantities that have columns of their own.
     """
 
     index: int
@@ -115,7 +115,7 @@ def _outcome(shot: Shot, run: Run) -> str:
 
 
 def shot_table(shots: Sequence[ShotRow], *, details: bool = False, most: int = 0) -> list[str]:
-    """A row per shot; with details also scanned values and batches."""
+    """A row per shot. With details also scanned values and batches."""
     first = shots[0] if shots else None
     is_judged = any(not math.isnan(shot.filling_fraction) for shot in shots)
     moves = any(shot.n_cycles for shot in shots)
@@ -150,7 +150,7 @@ def _scanned(address: str) -> Callable[[ShotRow], str]:
 
 @dataclass(frozen=True, slots=True)
 class SkippedScan:
-    """A scan of which every point was skipped."""
+    """A scan whose points were all skipped."""
 
     n_shots: int
 
@@ -159,13 +159,13 @@ class SkippedScan:
         return {"points": []}
 
     def as_text(self) -> list[str]:
-        """Why there is no table."""
-        return [f"no point of the scan has a shot: all {self.n_shots} shots were skipped"]
+        """The reason why there is no table."""
+        return [f"no point of the scan has a shot, because all {self.n_shots} shots were skipped"]
 
 
 @dataclass(frozen=True, slots=True)
 class RunTables:
-    """The tables of a run that were asked for, None for the others.
+    """The requested tables of a run, None for the others.
 
     Attributes:
         shot_list: The shots, with attempts that did not complete.
@@ -183,7 +183,7 @@ class RunTables:
 
     @classmethod
     def of(cls, run: Run, wanted: Tables) -> RunTables:
-        """The wanted tables.
+        """Read the requested tables.
 
         Raises:
             ConfigError: A table has no data, or the request for the scan cannot be met.
@@ -199,7 +199,7 @@ class RunTables:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """The tables that were asked for; of the scan, its points stand beside them."""
+        """The requested tables. The points of a scan are keys at the same level."""
         values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "scan"}
         wanted = {name: value for name, value in values.items() if value is not None}
         return wanted | (self.scan.as_json() if self.scan else {})
@@ -222,10 +222,10 @@ def _read_scan(run: Run, request: ScanRequest) -> ScanReport | SkippedScan:
 
 
 def _read_timing(run: Run) -> RunTiming:
-    """The durations of the stages of a run's shots; for a long run, of a selection of shots.
+    """The durations of the stages of a run's shots. For a long run, of a selection of shots.
 
     Raises:
-        ConfigError: It has no shots that can be read.
+        ConfigError: The run has no shots that can be read.
     """
     from labseq.analysis.overview import PART_SHOTS, evenly
     from labseq.analysis.timing import timing_of
@@ -238,7 +238,7 @@ def _read_timing(run: Run) -> RunTiming:
 
 
 def timing_table(timing: RunTiming) -> list[str]:
-    """A row per stage: its budget and its durations."""
+    """A row per stage, with its budget and durations."""
     clock = "modelled" if timing.simulated else "measured"
     columns: list[Column[StageStatistics]] = [
         Column("stage", lambda stage: clean(stage.stage)),

@@ -1,4 +1,4 @@
-"""The summary of a run: a table of its points or cycles, and a few lines of statistics; the same as JSON."""
+"""The summary of a run, with a table of its points or cycles and a few lines of statistics. Also as JSON."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from labseq.units import format_quantity
 from labseq.watchdog import watchdog_lines
 
 MAX_ROWS: Final = 40
-"""Maximum number of rows of a table; of a longer one the first and the last are shown."""
+"""Maximum number of rows of a table. The first and last rows of a longer table are shown."""
 MAX_LISTED: Final = 5
 """Maximum number of reasons, and of shots for each, that are listed one by one."""
 MAX_DEFECTS: Final = 6
@@ -53,39 +53,39 @@ class SkippedShots:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
-    """The result of a run. Of a run that never started, only the status and the error are known.
+    """The result of a run. If the run never started, only the status and the error are known.
 
     Attributes:
         run_dir: The run's folder.
         name: Name of the sequence.
         profile: Name of the hardware profile.
-        target: Name of the target; "" without one.
+        target: Name of the target, or "".
         changes: Settings changed by ``--set`` and other options: address -> value, as it was typed.
         note: The note about the run.
-        tags: Its tags.
+        tags: Tags of the run.
         shots: Number of shots that were taken.
         skipped: Number of shots that were skipped.
         defect_free: Fraction of the shots that met the target.
         filling_fraction: Mean filling of the target.
         status: "complete", "stopped", "failed" or "running".
-        error: Why it failed.
-        ended_early: Why it is complete before its last shot.
+        error: Why the run failed.
+        ended_early: Why the run is complete before its last shot.
         statistics: Results of the shots.
-        n_shots: Number of shots that were asked for.
-        skipped_shots: Why shots were skipped, each reason with its shots.
+        n_shots: Requested number of shots.
+        skipped_shots: The reasons why shots were skipped, each with its shots.
         n_attempts: Number of attempts that did not complete.
         has_target: Whether the sequence has a target.
-        n_atoms: Mean number of atoms on the first and on the last image; none without images.
-        measured: What the run measures, each with its mean over all shots.
-        scan: What the run measures at each point of the scan, with its fits.
-        results: Name and value of what the sequence asks the fits for.
+        n_atoms: Mean number of atoms on the first and on the last image. Empty without images.
+        measured: The measured quantities, each with its mean over all shots.
+        scan: The measured quantities at each point of the scan, with fits.
+        results: Name and value of each requested result of a fit.
         best: The best point of an adaptive scan.
-        best_shot: The shot that came nearest to the target.
+        best_shot: The shot that came closest to the target.
         simulated_time_s: Time that the shots took in a simulated run.
-        wall_time_s: Time on the computer's clock until the end of the last shot; of a resumed run, of all
-            its parts together.
-        watchdog: What the watchdog did.
-        resumed: Where it was resumed, and how it had ended before.
+        wall_time_s: Time on the computer's clock until the end of the last shot, summed over
+            all parts of a resumed run.
+        watchdog: The watchdog's actions.
+        resumed: Where the run was resumed, and how it had ended before.
         n_damaged_lines: Lines of the index that cannot be read.
     """
 
@@ -122,7 +122,7 @@ class Summary:
 
     @classmethod
     def of(cls, run: Run) -> Summary:
-        """The result of a run, so far."""
+        """The result of a run so far."""
         scan = None if scanned(run) is None else scan_report(run, ScanRequest())
         return cls(
             run_dir=run.path,
@@ -158,12 +158,12 @@ class Summary:
         )
 
     def ended_by(self, failure: BaseException) -> Summary:
-        """The same, with an error that the run's files need not have: the disk may be full."""
+        """The same with an error, which may be missing in the run's files because the disk was full."""
         status = "stopped" if isinstance(failure, StopRequested | KeyboardInterrupt) else "failed"
         return replace(self, status=status, error="\n".join(lines_of(failure)))
 
     def as_json(self) -> dict[str, Any]:
-        """All attributes; of the scan, its points stand beside them."""
+        """All attributes. The points of a scan are keys at the same level."""
         values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "scan"}
         values["measured"] = {quantity.name: mean for quantity, mean in self.measured}
         values["results"] = dict(self.results)
@@ -201,7 +201,7 @@ class Summary:
         ]
 
     def _about(self) -> Facts:
-        """What the run was: files, changed settings, note and tags."""
+        """Files, changed settings, note and tags of the run."""
         on, to = f" on {self.profile}" if self.profile else "", f", to {self.target}" if self.target else ""
         rows = {
             "sequence": f"{self.name}{on}{to}",
@@ -224,7 +224,7 @@ def _best_rows(best: BestPoint | None) -> Facts:
 
 
 def _best_shot_rows(best: BestShot | None) -> Facts:
-    """The shot to look at first: its number, and how near to the target it came."""
+    """The number of the shot to look at first, and how close to the target it came."""
     if best is None:
         return []
     filled = "defect-free" if best.success else f"{percent(best.filling)} filled"
@@ -233,7 +233,7 @@ def _best_shot_rows(best: BestShot | None) -> Facts:
 
 
 def _resumed(run: Run) -> list[str]:
-    """A line for each time that a run was resumed; runs of earlier versions do not tell how they ended."""
+    """A line for each time that a run was resumed. Runs of earlier versions do not record how they ended."""
     entries: Any = run.record.get("resumed") or ()
     return [
         f"at shot {entry.get('first_shot')}, after it had {one_line(str(entry.get('before', 'ended early')))}"
@@ -254,19 +254,19 @@ def _atom_rows(n_atoms: Sequence[Estimate]) -> Facts:
 
 
 def _measured_rows(measured: Sequence[tuple[Quantity, Estimated]], *, is_judged: bool) -> Facts:
-    """What a run measures over all its shots; what has rows of its own is left out.
+    """The measured quantities over all shots, without those that have rows of their own.
 
-    Of shots that are not judged, the filling of their last image is told here.
+    If shots are not judged, this includes the filling of their last image.
     """
     own = (one for one in measured if one[0].name not in (WITH_TARGET if is_judged else WITH_TARGET[1:]))
     return [(title_of(quantity), _mean_text(quantity, mean)) for quantity, mean in own]
 
 
 def _mean_text(quantity: Quantity, mean: Estimated) -> str:
-    """A mean over the shots of a run; none has a value where the sequence names what is never read."""
+    """A mean over the shots of a run, or a hint if no shot has a value because it is never read."""
     if not math.isnan(mean.value):
         return value_text(mean, quantity)
-    return f"no shot has it; labseq show --scan {clean(quantity.name)} names what there is"
+    return f"no shot has this value; see the available values with labseq show --scan {clean(quantity.name)}"
 
 
 CYCLES: Final[Sequence[Column[CycleStatistics]]] = (
@@ -281,11 +281,11 @@ CYCLES: Final[Sequence[Column[CycleStatistics]]] = (
 
 
 def cycle_table(statistics: Statistics | None) -> list[str]:
-    """A row per cycle, judged on the image at its end; empty without cycles."""
+    """A row per cycle, judged on the image at its end. Empty without cycles."""
     if statistics is None or not statistics.cycles:
         return []
     ended = statistics.cycles[-1].n_shots < statistics.cycles[0].n_shots
-    reached = "; only shots that reached it count" if ended else ""
+    reached = ", and only shots that reached it count" if ended else ""
     return [*table(statistics.cycles, CYCLES), f"each cycle is judged on its own final image{reached}"]
 
 
@@ -329,7 +329,7 @@ def statistics_rows(results: Statistics | None) -> Facts:
 
 
 def histogram_text(counts: Sequence[int]) -> str:
-    """The number of shots with each number of defects, as text; high numbers are counted together.
+    """The number of shots with each number of defects, as text. High numbers are counted together.
 
     Example:
         >>> histogram_text((7, 5, 0, 2))
@@ -371,7 +371,7 @@ def _numbers(shots: Sequence[int]) -> str:
 
 
 def _time_rows(simulated_s: float, wall_s: float) -> Facts:
-    """How long it took; beside the time of the shots of a simulated run, that of the computer is named."""
+    """The duration of the run. For a simulated run both the shots' time and the computer's time are given."""
     wall_time = "-" if math.isnan(wall_s) else format_quantity(wall_s, "time")
     if math.isnan(simulated_s):
         return [("wall time", wall_time)]

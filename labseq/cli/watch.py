@@ -26,10 +26,10 @@ def watch_run(
     *,
     follow: bool = False,
 ) -> None:
-    """Show a run until it ends, then print its summary; only its files are read.
+    """Show a run until it ends, then print its summary. Only its files are read.
 
     Args:
-        follow: Whether to wait for the next run in the data folder then, and show that, until Ctrl-C.
+        follow: Whether to then wait for the next run in the data folder and show that, until Ctrl-C.
     """
     # resolved, to be compared with other runs: the data folder may be relative, or a link
     run_dir, shown = folder_of_run(path).resolve(), stream or sys.stdout
@@ -41,7 +41,7 @@ def watch_run(
             _watch_one(run_dir := newest, shown, wait)
     except KeyboardInterrupt:
         state = "is over" if Follower(run_dir).is_over else "continues"
-        say(f"no longer watched; the run {run_dir} {state}", stream=shown)
+        say(f"stopped watching the run {run_dir}, which {state}", stream=shown)
 
 
 def _watch_one(run_dir: Path, shown: TextIO, wait: Callable[[float], None]) -> None:

@@ -58,8 +58,8 @@ def test_what_cannot_be_exported_is_reported(
 @pytest.mark.parametrize(
     ("status", "printed"),
     [
-        (None, "warning: the run is still in progress; exported are the 1 shot of 2 taken so far\n"),
-        ("stopped", "warning: the run did not complete (stopped); exported are 1 shot of 2\n"),
+        (None, "warning: the run is still in progress, so only the 1 shot of 2 taken so far are exported\n"),
+        ("stopped", "warning: the run is stopped, so only 1 shot of 2 are exported\n"),
     ],
 )
 def test_a_run_that_did_not_complete_is_exported_as_far_as_it_came(

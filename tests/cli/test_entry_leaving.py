@@ -34,7 +34,7 @@ def leave(tmp_path: Path, command: str, *, daemon: bool) -> subprocess.Completed
 def test_a_thread_that_never_ends_does_not_keep_the_process(tmp_path: Path) -> None:
     done = leave(tmp_path, "plan random:20x20@0.75 --target compact_225 --planner none", daemon=False)
     assert done.returncode == 2
-    assert "a thread of a plugin did not end: labseq test poller; " in done.stderr
+    assert "a thread of a plugin did not end and stopped with the process: labseq test poller" in done.stderr
     assert "still in the buffer" in done.stdout
 
 

@@ -205,7 +205,7 @@ class TestQuestions:
         assert code == 0
         assert read_contact(JSON)["measured"] == {"fine": {"took_s": 1.5}, "seen": {"delay_s": 250e-6}}
         assert "'3 V' is a voltage, not a time" in out
-        assert "2 s makes no sense here; expected 0 s to 1 ms" in out
+        assert "2 s is out of range; expected 0 s to 1 ms" in out
         assert "'12' has no unit" in out
 
     def test_without_the_instrument_a_step_is_left_out(self, call: Any, types: Any) -> None:

@@ -89,7 +89,7 @@ def test_a_program_that_refuses_nothing_fails_the_test(
         (
             ["--token", "none"],
             2,
-            "the token cannot be read: [Errno 2] No such file or directory: 'none'",
+            "the leader's token cannot be read: [Errno 2] No such file or directory: 'none'",
         ),
         (["--port", "1"], 3, "127.0.0.1:1: Connection refused; run a sequence with a step 'wait: {for: go}'"),
     ],

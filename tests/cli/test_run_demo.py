@@ -80,7 +80,7 @@ def test_copies_can_be_run_and_are_never_replaced(capsys: pytest.CaptureFixture[
 @pytest.mark.parametrize(
     ("arguments", "printed"),
     [
-        (["--copy", ".", "--shots", "3"], "it runs nothing; leave out --shots and --output"),
+        (["--copy", ".", "--shots", "3"], "it only copies files; leave out --shots and --output"),
         (["--copy", ".", "--output", "x"], "it runs nothing"),
         (["--shots", "0"], "shots is 0; expected at least 1"),
         (["compact_225"], "unexpected extra argument"),

@@ -47,7 +47,7 @@ def test_the_runs_of_a_folder(data: Path, call: Any) -> None:
     rows = [line.split() for line in out.splitlines()]
     names = [f"{DAYS[0]}/{n}" for n in (1, 2, 3, 4, 10_000)] + [f"{DAYS[1]}/{n}" for n in (1, 10_000)]
     assert (code, err, [row[0] for row in rows[1:8]]) == (0, "", names)
-    assert out.splitlines()[9] == "3 runs cannot be read: `labseq doctor` says why"
+    assert out.splitlines()[9] == "3 runs cannot be read; `labseq doctor` says why"
     assert rows[1][2:] == ["compact-225", "-", "filling", "100", "%", "2", "of", "2", "complete"]
     assert rows[2][2:] == ["0002_half", "-", "-", "-", "damaged"]
 

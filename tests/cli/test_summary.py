@@ -68,7 +68,7 @@ def test_what_a_run_measures_is_never_blank(fake: Any) -> None:
     statistics = replace(STATISTICS, defect_free=Rate(0, 0), filling=UNKNOWN, defects=(), cycles=())
     text = [" ".join(line.split()) for line in Summary(statistics=statistics, measured=measured).as_text()]
     assert "filling 97.1(3) %" in text
-    needed = "no shot has it; labseq show --scan reading.laser.power_w names what there is"
+    needed = "no shot has this value; see the available values with labseq show --scan reading.laser.power_w"
     assert f"reading.laser.power_w {needed}" in text
 
 

@@ -91,7 +91,7 @@ def test_ctrl_c_leaves_the_run_alone(watched: WrittenRun) -> None:
         raise KeyboardInterrupt
 
     lines = watched.watch(interrupt)
-    assert lines[-1] == f"no longer watched; the run {watched.writer.run_dir} continues"
+    assert lines[-1] == f"stopped watching the run {watched.writer.run_dir}, which continues"
     assert open_run(watched.writer.run_dir).status == "running"
 
 

@@ -112,7 +112,7 @@ def test_a_queue_that_keeps_going_ends_with_the_first_failure(
     [
         (("queue", "remove", "5"), "error: the queue has no entry 5"),
         (("stop", "--profile", "./p.yaml"), "error: no run is in progress on the profile ./p.yaml"),
-        (("stop", "--queue"), "error: no process runs the queue; 'labseq stop' "),
+        (("stop", "--queue"), "error: no process runs the queue; to end a run use 'labseq stop' "),
         (("stop", "nowhere"), "nowhere: no such file or folder"),
     ],
 )
