@@ -52,9 +52,7 @@ DryRun = Annotated[
         show_choices=False,
     ),
 ]
-Force = Annotated[
-    bool, typer.Option("--force", help="Use it even if it is worse than the calibration in use.")
-]
+Force = Annotated[bool, typer.Option("--force", help="Use it even if it is worse than the one in use.")]
 Id = Annotated[str, typer.Argument(metavar="ID", help=ID_HELP, show_default=False)]
 
 

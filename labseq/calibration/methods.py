@@ -260,9 +260,7 @@ def fit_frequencies(
     """
     offset, n, k = checked_counts(offset_m, n_before, n_survived)
     if n.shape[1:] != grid.shape:
-        raise ValueError(
-            f"the counts have shape {n.shape}; expected (n_points, {grid.n_rows}, {grid.n_cols})"
-        )
+        raise ValueError(f"counts of shape {n.shape}; expected (n_points, {grid.n_rows}, {grid.n_cols})")
     overlay = fit_overlay(offset, n, k, grid)
     # beyond the reach no atom survives, wherever the centre is
     near = distance_m(offset - overlay.centre_m, unit_axes(grid)) < overlay.shape.reach_m
@@ -431,4 +429,4 @@ def offset_text(fit: OverlayFit, probed: ProbeCounts) -> str:
     along, across = (format_quantity(float(-centre), "length") for centre in fit.centre_m)
     use = ", in addition to the correction in use" if np.any(probed.in_use_m) else ""
     where = f"from the sites by {along} along rows and {across} from row to row{use}"
-    return f"{fit.n_atoms} atoms show that the mobile tweezers were offset {where}"
+    return f"{fit.n_atoms} atoms: the mobile tweezers were offset {where}"

@@ -279,7 +279,7 @@ def _origin_text(value: Any) -> str:
 def _time_text(taken_utc: str | None) -> str:
     if taken_utc is None:
         return "-"
-    return f"{datetime.fromisoformat(taken_utc).astimezone(UTC):%Y-%m-%d\xa0%H:%M}\xa0UTC"  # never broken over two lines
+    return f"{datetime.fromisoformat(taken_utc).astimezone(UTC):%Y-%m-%d\xa0%H:%M}\xa0UTC"  # never broken
 
 
 def calibrate_kind(kind: str, request: CalibrationRequest, *, as_json: bool) -> None:

@@ -187,7 +187,7 @@ def test_a_source_with_an_error_is_refused(lab: Any, kind: str, name: str, messa
     [
         ("overlay", "the run does not scan the offset of a probe"),
         ("frequencies", "the run does not scan the offset of a probe"),
-        ("tweezers", "no shot of it equalised the tweezers; expected a run with the step"),
+        ("tweezers", "no shot of this run equalised the tweezers; expected a run with the step"),
     ],
 )
 def test_a_run_for_another_kind_is_refused(measured: Any, lab: Any, kind: str, message: str) -> None:
@@ -249,7 +249,7 @@ def test_the_time_to_the_light_is_measured_and_used_instead_of_the_profiles(
     assert resolve_profile(str(lab.profile)).motion.overhead_per_cycle_s == overhead_s
     again = lab.calibrate("timing", source=outcome.run.path)
     assert again.stored.entry.values["overhead_s"] == [overhead_s]
-    with pytest.raises(ConfigError, match="no shot of it moved atoms"):
+    with pytest.raises(ConfigError, match="no shot of this run moved atoms"):
         lab.calibrate("timing", shots=1, overrides=["profile.simulation.loading=0 %"])
 
 

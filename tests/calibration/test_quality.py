@@ -26,7 +26,9 @@ def test_a_figure_half_as_large_again_is_worse_where_it_matters(kind: Calibratio
 
 def test_fewer_sites_are_worse() -> None:
     old = entry("sites", 0.01, n_sites_found=12)
-    assert "it found 11 sites, the one in use 12" in why_worse(entry("sites", 0.01, n_sites_found=11), old)
+    assert "it found 11 sites, but the calibration in use found 12" in why_worse(
+        entry("sites", 0.01, n_sites_found=11), old
+    )
     assert not why_worse(entry("sites", 0.01, n_sites_found=12), old)
     assert not why_worse(entry("sites", 0.01), old)  # from a file: nothing was looked for
 

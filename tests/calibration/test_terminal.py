@@ -164,7 +164,7 @@ def test_a_calibration_is_put_to_use_and_none(store: Store, capsys: pytest.Captu
     )
     code, _, err = call(capsys, "use", worse.entry.id)
     assert code == 2
-    assert "its error_m is 1e-06, that of the one in use 2e-08; use it anyway with --force" in err
+    assert "its error_m is 1e-06, but 2e-08 for the calibration in use; use it anyway with --force" in err
     assert call(capsys, "use", worse.entry.id, "--force")[0] == 0
     assert call(capsys, "use", "overlay=off")[:2] == (
         0,

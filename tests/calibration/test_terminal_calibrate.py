@@ -72,7 +72,7 @@ def test_a_worse_one_is_kept_and_reported(store: Store, capsys: pytest.CaptureFi
     new = next(one for one in store.entries() if one.path != better.path)
     assert code == 2
     assert out.startswith(f"sites {new.path.stem[-12:]}: not in use")
-    assert "it found 36 sites, the one in use 40" in err
+    assert "it found 36 sites, but the calibration in use found 40" in err
 
 
 def test_an_analysis_that_fails(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
@@ -94,8 +94,11 @@ def test_an_analysis_that_fails(store: Store, capsys: pytest.CaptureFixture[str]
         ),
         (("sites", "--from", "nowhere"), "nowhere: no such file or folder, and no run of this name"),
         (("sites", "--shots", "0"), "--shots 0: shots is 0; expected at least 1"),
-        (("sites", "--centre", "12"), "--centre: '12'; expected Y,X: two numbers of pixels"),
-        (("overlay", "--centre", "1,2"), "--centre: a calibration of overlay has no centre; expected sites"),
+        (("sites", "--centre", "12"), "--centre: '12'; expected two numbers of pixels Y,X"),
+        (
+            ("overlay", "--centre", "1,2"),
+            "--centre: a calibration of overlay takes no --centre; expected sites",
+        ),
     ],
 )
 def test_wrong_usage(

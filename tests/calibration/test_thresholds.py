@@ -120,7 +120,7 @@ def test_one_site_is_enough() -> None:
     full = rng.random((200, 1, 1)) < 0.6
     found = fit_thresholds(rng.normal(np.where(full, 9.0, 0.0), 1.0))
     assert 3.0 < found.thresholds[0, 0] < 6.0
-    with pytest.raises(DeviceError, match="1 of 1 sites show one peak"):
+    with pytest.raises(DeviceError, match="1 of 1 sites show only one peak"):
         fit_thresholds(rng.normal(0.0, 1.0, (200, 1, 1)))
 
 
@@ -256,13 +256,13 @@ def test_one_peak_on_all_sites_is_an_error(loading: float) -> None:
     signals = Emccd(np.random.default_rng(6)).draw(200, loading)
     with pytest.raises(
         DeviceError,
-        match=r"of 144 sites show one peak in the histogram of the counts, not two; check the loading",
+        match=r"of 144 sites show only one peak in the histogram of the counts; check the loading",
     ):
         fitted(signals)
 
 
 def test_equal_frames_say_that_they_are_black_or_saturated() -> None:
-    with pytest.raises(DeviceError, match=r"144 of 144 sites show one peak.* black or saturated"):
+    with pytest.raises(DeviceError, match=r"144 of 144 sites show only one peak.* black or saturated"):
         fitted(np.zeros((50, N_SITES)))
 
 
