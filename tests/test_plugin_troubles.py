@@ -116,8 +116,8 @@ AT_LOADING = [
         "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)",
         "ValueError: signal only works in main thread",
     ),
-    ("LABSEQ_API = 1", "LABSEQ_API = 2", "LABSEQ_API 2; this labseq has LABSEQ_API = 1; up"),
-    ("LABSEQ_API = 1", "", "does not state LABSEQ_API; this labseq has LABSEQ_API = 1"),
+    ("LABSEQ_API = 1", "LABSEQ_API = 2", "LABSEQ_API 2, but this labseq has LABSEQ_API = 1; up"),
+    ("LABSEQ_API = 1", "", "does not state LABSEQ_API; write 'LABSEQ_API = 1'"),
     ("LABSEQ_API = 1", "LABSEQ_API = '1.0'", "'1.0', which is not a whole number"),
     ("def labseq_register", "def labseq_regster", "unknown hook 'labseq_regster'"),
     (
@@ -326,7 +326,7 @@ def test_what_plugins_print_spoils_no_json(
     found = {one["name"]: one for one in json.loads(out)["plugins"]}
     assert "hello" in err
     assert found["mine"]["offers"] == ["planner:mine"]
-    assert "it printed ('hello again'); this went to stderr" in found["mine"]["notes"][0]
+    assert "it printed 'hello again' to stderr" in found["mine"]["notes"][0]
     assert (found["other"]["state"], found["other"]["offers"]) == ("failed", [])
     assert {one["state"] for name, one in found.items() if name != "other"} == {"loaded"}
     assert [name for name, one in found.items() if one["notes"]] == ["mine"]  # labseq's own print nothing

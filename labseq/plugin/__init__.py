@@ -1,23 +1,23 @@
-"""What plugins import from labseq: the roles, the types of their methods, settings, errors and kernels.
+"""The API for plugins: roles, the types of their methods, settings, errors and kernels.
 
-What only some plugins need is in modules by subject:
+Parts that only some plugins need are in modules by subject:
 
 - ``camera``: base class of camera drivers, their settings, cooling, a simulated sensor
-- ``camera_simulator``, ``sdk_camera``: what simulators of cameras, and drivers on a vendor's library, share
-- ``first_contact``: steps that prove what a driver assumes, and the file of what they measured
-- ``geometry``: sites of a grid: blocks, patterns, their order from the centre
+- ``camera_simulator``, ``sdk_camera``: shared code of camera simulators, and of drivers on vendors' libraries
+- ``first_contact``: steps that test the assumptions of a driver, and the file with their results
+- ``geometry``: blocks of sites of a grid, patterns, the order of sites from the centre
 - ``leader``: settings, log and simulation of another control system that starts the shots
 - ``lines``: programs of a timing box, and the line that triggers a device
 - ``messages``: wording of error messages
-- ``motion``: from a plan to tones, and to the samples of an AWG
-- ``native``: calls of C from compiled code; clocks, signals and priority of threads without Python
+- ``motion``: conversion of a plan to tones, and to the samples of an AWG
+- ``native``: calls of C from compiled code, and clocks, signals and thread priorities without Python
 - ``planning``: checking, comparing and following plans
 - ``runs``: reading recorded runs
-- ``serial``: serial ports, and devices that are switched off over one
-- ``simulation``: what simulated devices pass to a simulation that acts on their outputs
+- ``serial``: serial ports, and devices that are switched off over a serial port
+- ``simulation``: data from simulated devices to a simulation that acts on their outputs
 - ``system``: folders for files that outlive a run, other processes, a clock outside of a run
-- ``tweezers``: checks and amplitudes that drivers of static tweezers share
-- ``units``, ``wire``: quantities as text; messages between computers
+- ``tweezers``: shared checks and amplitudes for drivers of static tweezers
+- ``units``, ``wire``: quantities as text, messages between computers
 
 A plugin needs no other module of labseq, except :mod:`labseq.testing` in its tests.
 """

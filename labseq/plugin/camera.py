@@ -1,4 +1,4 @@
-"""What camera drivers share: a base class, settings, series of exposures, cooling, a simulated sensor."""
+"""Shared code of camera drivers: base class, settings, series of exposures, cooling, simulated sensor."""
 
 from __future__ import annotations
 

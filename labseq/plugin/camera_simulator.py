@@ -1,4 +1,4 @@
-"""What simulators of cameras share: exposures at triggers, a ring buffer of frames, failures."""
+"""Shared code of camera simulators: exposures at triggers, a ring buffer of frames, failures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps in which a driver proves what it assumes about its device, and the file of what they measured."""
+"""Steps that test a driver's assumptions about its device, and the file with their results."""
 
 from __future__ import annotations
 

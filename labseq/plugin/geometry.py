@@ -1,4 +1,4 @@
-"""Sites of a grid: blocks of them, patterns, their order from the centre."""
+"""Blocks of sites of a grid, patterns, and the order of sites from the centre."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ __all__ = [
 
 
 def from_the_centre(fill: NDArray[np.bool_], grid: SiteGrid) -> NDArray[np.intp]:
-    """List fill sites, those nearest to their common centre first.
+    """List fill sites, beginning with the sites nearest to their common centre.
 
-    Distances are those on the lattice; of sites equally far the one in the upper
-    row, then in the left column, comes first.
+    Distances are measured on the lattice. Among equally distant sites, the order is by row from the top, then
+    by column from the left.
 
     Args:
         fill: bool (n_rows, n_cols).
-        grid: Tells the lattice.
+        grid: The grid, for its lattice.
 
     Returns:
-        int (n_fill,), row * n_cols + column of each: indices of ``fill.reshape(-1)``.
+        int (n_fill,), row * n_cols + column of each, as indices of ``fill.reshape(-1)``.
 
     Example:
         >>> from_the_centre(np.ones((1, 5), np.bool_), SiteGrid()).tolist()
         [2, 1, 3, 0, 4]
     """
     rows, cols = np.nonzero(fill)
-    down = len(rows) * rows - rows.sum()  # from the centre, times the number of sites: exact in integers
+    down = len(rows) * rows - rows.sum()  # from the centre, times the number of sites, exact in integers
     right = len(cols) * cols - cols.sum()
     shear = grid.shear if grid.lattice == "triangular" else 0
     distance = down**2 + right**2 + shear * down * right  # |right a1 + down a2|^2 / a^2
@@ -46,17 +46,17 @@ def from_the_centre(fill: NDArray[np.bool_], grid: SiteGrid) -> NDArray[np.intp]
 
 
 def nearest_to_centre(fill: NDArray[np.bool_], n_sites: int, grid: SiteGrid) -> NDArray[np.bool_]:
-    """Keep the fill sites that lie nearest to their common centre, see :func:`from_the_centre`.
+    """Keep the fill sites nearest to their common centre (see :func:`from_the_centre`).
 
-    This is what a planner fills when it has only ``n_sites`` atoms.
+    A planner with only ``n_sites`` atoms fills these sites.
 
     Args:
         fill: bool (n_rows, n_cols).
-        n_sites: How many sites to keep at most.
-        grid: Tells the lattice.
+        n_sites: Maximum number of sites to keep.
+        grid: The grid, for its lattice.
 
     Returns:
-        bool (n_rows, n_cols); ``fill`` itself if it has no more sites.
+        bool (n_rows, n_cols), ``fill`` itself if it has no more sites.
 
     Example:
         >>> nearest_to_centre(np.ones((1, 5), np.bool_), 2, SiteGrid()).tolist()
@@ -96,7 +96,7 @@ def block(rows: int, cols: int, grid_shape: tuple[int, int]) -> tuple[NDArray[np
     Args:
         rows: Rows of the block.
         cols: Columns of the block.
-        grid_shape: (n_rows, n_cols) of the grid, which must be able to hold it.
+        grid_shape: (n_rows, n_cols) of the grid, which must be large enough.
 
     Returns:
         int64 (rows, cols) each, from 0 at the block's top left site.
@@ -122,9 +122,8 @@ def place(
     Args:
         mask: bool (rows, cols).
         grid_shape: (n_rows, n_cols) of the grid.
-        origin: (row, col) of the mask's top left site; None centres it. If the
-            free rows or columns cannot be shared evenly, the mask sits one site
-            nearer to the top and to the left.
+        origin: (row, col) of the mask's top left site. None centres it. With an odd number of free rows or
+            columns, the mask is one site nearer to the top or to the left.
 
     Returns:
         bool (n_rows, n_cols), False outside of the mask.
@@ -156,9 +155,9 @@ def place(
 
 
 Origin: TypeAlias = tuple[int, int] | None
-"""(row, col) of the pattern's top left site; None centres it."""
+"""(row, col) of the pattern's top left site. None centres it."""
 Clear: TypeAlias = Literal["bounding_box", "none"]
-"""Which sites must be empty: every other site of the pattern's block, or none."""
+"""Sites that must be empty: every other site of the pattern's block, or none."""
 
 
 def pattern(
@@ -169,19 +168,18 @@ def pattern(
     clear: Clear = "bounding_box",
     name: str = "target",
 ) -> TargetPattern:
-    """Make a target from a mask; the last step of a plugin's pattern.
+    """Make a target from a mask, as the last step of a plugin's pattern.
 
     Args:
         mask: bool (rows, cols), True where an atom must be.
         grid: The grid that the target lies on.
-        origin: (row, col) of the mask's top left site; None centres it (one site
-            nearer to the top and to the left if it cannot be even).
-        clear: "bounding_box": all other sites of the mask's block must be empty;
-            "none": they are reservoir.
-        name: For records and the screen.
+        origin: (row, col) of the mask's top left site. None centres it as :func:`place` does.
+        clear: With "bounding_box" all other sites of the mask's block must be empty. With "none" they are
+            reservoir.
+        name: Name in records and on the screen.
 
     Raises:
-        LimitError: The mask holds no atom, is larger than the grid or sticks out of it.
+        LimitError: The mask has no atom, is larger than the grid or sticks out of it.
 
     Example:
         >>> target = pattern(np.eye(2, dtype=np.bool_), SiteGrid(2, 3), name="diagonal")

@@ -1,4 +1,4 @@
-"""What devices that receive the start signal of another control system share; see ``LeaderLink``."""
+"""Shared code of devices that receive the start signal of another control system. See ``LeaderLink``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 GO: Final = "go"
 """The start signal."""
 LEADER: Final = "leader"
-"""What times a step that the other control system does."""
+"""Name of the clock of steps that the other control system carries out."""
 
 
 class LeaderSettings(Settings):
@@ -38,7 +38,7 @@ class LeaderSettings(Settings):
     )
     simulated_go_delay: Duration = Field(
         default=0.5,
-        description="with a simulated control system: time after which it sends `go`; atoms load meanwhile",
+        description="with a simulated control system, time after which it sends `go`, while atoms load",
     )
 
 
@@ -72,16 +72,16 @@ class LeaderLog:
 
 
 def speaking_leader(devices: Mapping[str, object], name: str = "") -> str:
-    """Why no control system can be asked for a step through a device; "" if it can.
+    """Why no device can pass a step to another control system, or "" if one can.
 
     Args:
         devices: All hardware of the profile.
-        name: Name of the device; "" for the only one there is.
+        name: Name of the device. "" for the only such device.
     """
     able = [other for other, device in devices.items() if isinstance(device, LeaderDialogue)]
     if not able:
         hint = "`leader: {use: tcp_leader}` among its `devices`"
-        return f"the profile has no device through which a leader speaks; expected {hint}"
+        return f"the profile has no device that connects to a leader; expected {hint}"
     if name in able or (not name and len(able) == 1):
         return ""
     return f"expected {one_of(able)} as `device`"
@@ -91,7 +91,7 @@ def check_signal(signal: str, device: str) -> None:
     """Refuse to wait for anything but `go`.
 
     Raises:
-        DeviceError: It is another signal.
+        DeviceError: The signal is another one.
     """
     if signal != GO:
         raise DeviceError(device, f"unknown signal '{signal}'; expected '{GO}'")
@@ -101,24 +101,24 @@ def load_until_go(context: Context, delay_s: float, timeout_s: float) -> None:
     """Do what a simulated control system does before it sends `go`: load the atoms.
 
     Args:
-        context: That of the device.
-        delay_s: How long that takes, in seconds of the session's clock.
-        timeout_s: How long the device waits for `go`.
+        context: The context of the device.
+        delay_s: Loading time, in seconds of the session's clock.
+        timeout_s: Longest wait of the device for `go`.
 
     Raises:
         DeviceTimeoutError: `go` comes too late.
     """
     if delay_s > timeout_s:
         context.clock.sleep(timeout_s)
-        text = f"the simulated leader says '{GO}' after {format_quantity(delay_s, 'time')}"
+        text = f"the simulated leader sends '{GO}' after {format_quantity(delay_s, 'time')}"
         raise DeviceTimeoutError(context.name, f"{text}; see 'simulated_go_delay'", timeout_s)
     load_atoms(context, delay_s)
 
 
 def load_atoms(context: Context, duration_s: float) -> None:
-    """Load the simulated lab as the other control system would have, unless this shot has atoms already.
+    """Load the simulated lab like the other control system, unless this shot has atoms already.
 
-    At a second wait in a shot these are the rearranged atoms.
+    At a second wait in a shot, the atoms are the rearranged ones.
     """
     start_s = context.clock.now()
     context.clock.sleep(duration_s)

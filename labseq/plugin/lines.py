@@ -1,4 +1,4 @@
-"""Programs of a timing box, the line that triggers a device, and who leads."""
+"""Programs of a timing box, the line that triggers a device, and the leader."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a plan to tones."""
+"""Conversion of a plan to tones."""
 
 from __future__ import annotations
 

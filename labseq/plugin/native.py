@@ -1,4 +1,4 @@
-"""Calls of C from compiled code, clocks and signals without Python, priority of threads."""
+"""Calls of C from compiled code, and clocks, signals and thread priorities without Python."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kernels that grow a plan, for the kernels of planners: atom moves, batches, the batches of a line.
+"""Kernels that add atom moves and batches to a plan, for the kernels of planners.
 
 Each kernel takes the plan and returns it, because the arrays are replaced when they are full::
 
@@ -6,9 +6,9 @@ Each kernel takes the plan and returns it, because the arrays are replaced when 
     plan = end_batch(add_move(plan, row, col, to_row, to_col), False)
     return finished(plan)
 
-The atoms of a line, which is a row or a column, keep their order. What moves in it is therefore two ascending
-lists of its sites: where its atoms are (``source``) and where they go (``goal``). Sites below 0 and from
-``n_sites`` on lie outside of the grid and stand for ejection.
+The atoms of a line, which is a row or a column, keep their order. Its moves are therefore two ascending lists
+of sites, with the atoms before (``source``) and after (``goal``). Sites below 0, and ``n_sites`` or more, are
+outside of the grid and mean ejection.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Ints = NDArray[np.int64]
 Moves = NDArray[np.int16]
 Offsets = NDArray[np.int32]
 GrowingPlan = tuple[Moves, Offsets, Bools, int]
-"""Moves; starts of all batches, and the end of the one being written; which are linked; number of batches."""
+"""Moves, starts of all batches and end of the current batch, linked flags, and number of batches."""
 FinishedPlan = tuple[Moves, Offsets, Bools]
 """moves, int16 (n_moves, 4), batch offsets, int32 (n_batches + 1,), and linked, bool (n_batches,)."""
 FINISHED_PLAN: Final = "Tuple((int16[:, ::1], int32[::1], bool_[::1]))"
@@ -64,7 +64,7 @@ SITES: Final = const("int64", 1)
 
 @helper_kernel(f"{GROWING_PLAN}(int64)")
 def empty_plan(n_moves: int) -> GrowingPlan:
-    """Make a plan without moves; it becomes longer than ``n_moves`` if need be."""
+    """Make a plan without moves, with room for ``n_moves``. It grows if necessary."""
     offsets = np.empty(n_moves + 2, np.int32)
     offsets[0] = offsets[1] = 0
     return np.empty((n_moves, 4), np.int16), offsets, np.empty(n_moves, np.bool_), 0
@@ -72,7 +72,7 @@ def empty_plan(n_moves: int) -> GrowingPlan:
 
 @helper_kernel(f"int64({GROWING_PLAN})")
 def count_moves(plan: GrowingPlan) -> int:
-    """Count the atom moves of a plan, those of the batch that is being written included."""
+    """Count the atom moves of a plan, including the current batch."""
     return plan[1][plan[3] + 1]
 
 
@@ -84,7 +84,7 @@ def with_room(plan: GrowingPlan, n_more: int) -> GrowingPlan:
     if n_moves + n_more <= len(moves):
         return plan
     longer = empty_plan(2 * len(moves) + n_more)
-    # element by element: numba takes seconds to compile the assignment of slices
+    # element by element, because numba takes seconds to compile the assignment of slices
     for n in range(n_moves):
         for k in range(4):
             longer[0][n, k] = moves[n, k]
@@ -97,7 +97,7 @@ def with_room(plan: GrowingPlan, n_more: int) -> GrowingPlan:
 
 @helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, int64, int64, int64, int64)")
 def add_move(plan: GrowingPlan, row: int, col: int, to_row: int, to_col: int) -> GrowingPlan:
-    """Add an atom move to the batch that is being written."""
+    """Add an atom move to the current batch."""
     plan = with_room(plan, 1)
     n = count_moves(plan)
     move = plan[0][n]
@@ -108,9 +108,9 @@ def add_move(plan: GrowingPlan, row: int, col: int, to_row: int, to_col: int) ->
 
 @helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, boolean)")
 def end_batch(plan: GrowingPlan, is_linked: bool) -> GrowingPlan:
-    """Go on with the next batch, unless this one has no atom moves.
+    """End the current batch and begin the next, unless the current batch has no atom moves.
 
-    It ``is_linked`` if its tweezers hold the same atoms since the batch before.
+    The ended batch ``is_linked`` if its tweezers hold the same atoms since the batch before.
     """
     moves, offsets, linked, n_batches = plan
     n_moves = count_moves(plan)
@@ -125,7 +125,7 @@ def end_batch(plan: GrowingPlan, is_linked: bool) -> GrowingPlan:
 def move_alone(
     plan: GrowingPlan, atoms: Bools, row: int, col: int, to_row: int, to_col: int, is_linked: bool
 ) -> GrowingPlan:
-    """Move one atom in a batch of its own; updates ``atoms``, bool (n_rows, n_cols)."""
+    """Move one atom in its own batch, and update ``atoms``, bool (n_rows, n_cols)."""
     atoms[row, col] = False
     atoms[to_row, to_col] = True
     return end_batch(add_move(plan, row, col, to_row, to_col), is_linked)
@@ -139,7 +139,7 @@ def finished(plan: GrowingPlan) -> FinishedPlan:
 
 
 def as_plan(arrays: tuple[NDArray[Any], ...]) -> Plan:
-    """Make a plan of what a kernel returned: arrays that nothing else holds."""
+    """Make a plan from the arrays of a kernel. Nothing else may hold these arrays."""
     for array in arrays:
         array.flags.writeable = False  # otherwise Plan would copy them
     return Plan(*arrays)
@@ -147,7 +147,7 @@ def as_plan(arrays: tuple[NDArray[Any], ...]) -> Plan:
 
 @helper_kernel(f"int64[::1]({const('bool_', 1)})")
 def sites_of(atoms: Bools) -> Ints:
-    """List the sites of a line's atoms, ascending."""
+    """List the sites of a line's atoms in ascending order."""
     sites = np.empty(len(atoms), np.int64)
     n = 0
     for site in range(len(atoms)):
@@ -160,7 +160,7 @@ def sites_of(atoms: Bools) -> Ints:
 def choose_next(
     source: Ints, goal: Ints, n_sites: int, limit: int, slots: int, turns: Ints, turn: int
 ) -> int:
-    """Choose the atoms of a line that move in its next batch; return how many. See :func:`take_turns`."""
+    """Choose the atoms of a line that move next, and return their number. See :func:`take_turns`."""
     n_atoms = len(source)
     n = n_low = n_high = 0
     for i in range(n_atoms):
@@ -194,19 +194,19 @@ def choose_next(
 def take_turns(source: Ints, goal: Ints, n_sites: int, limit: int, slots: int) -> Ints:
     """Distribute the atoms that move in a line over batches.
 
-    An atom can go once its neighbour ahead has cleared the way, at the latest in the same batch: atoms that
-    move up go from the upper end on, those that move down from the lower end. Ejections come first, because
-    only one per slot fits into a batch. Atoms that stay block none, because the order is kept.
+    An atom can move if its neighbour ahead clears the way before, or in the same batch. Atoms that move up
+    are taken from the upper end, atoms that move down from the lower end. Ejections come first, because only
+    one per slot fits into a batch. Atoms that stay block no others, because the order is kept.
 
     Args:
-        source: int64 (n_atoms,), where the atoms are, ascending.
-        goal: int64 (n_atoms,), where they go, ascending.
+        source: int64 (n_atoms,), sites of the atoms before, ascending.
+        goal: int64 (n_atoms,), sites of the atoms after, ascending.
         n_sites: Number of sites of the line.
         limit: Maximum number of atoms in a batch.
         slots: Ejection slots on each side, at least 1 if an atom is ejected.
 
     Returns:
-        int64 (n_atoms,), the batch in which each atom moves, from 1; 0 if it stays.
+        int64 (n_atoms,), the batch in which each atom moves, from 1, or 0 if it stays.
     """
     turns = np.zeros(len(source), np.int64)
     n_left = 0
@@ -221,7 +221,7 @@ def take_turns(source: Ints, goal: Ints, n_sites: int, limit: int, slots: int) -
 
 @helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, {LINE}, {SITES}, {SITES}, {SITES})")
 def add_turns(plan: GrowingPlan, line: Line, source: Ints, goal: Ints, turns: Ints) -> GrowingPlan:
-    """Add batches in which atoms of a line move when it is their turn, see :func:`take_turns`.
+    """Add batches in which the atoms of a line move in their turns (see :func:`take_turns`).
 
     Atoms that leave the grid in the same batch go to the sites next to it.
     """
@@ -253,7 +253,7 @@ def add_turns(plan: GrowingPlan, line: Line, source: Ints, goal: Ints, turns: In
 
 @helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, {LINE}, {SITES}, {SITES}, int64, int64)")
 def add_line(plan: GrowingPlan, line: Line, source: Ints, goal: Ints, limit: int, slots: int) -> GrowingPlan:
-    """Add the batches that rearrange a line, as few as ``limit`` and ``slots`` allow: :func:`take_turns`."""
+    """Add the fewest batches that rearrange a line within ``limit`` and ``slots`` (:func:`take_turns`)."""
     return add_turns(plan, line, source, goal, take_turns(source, goal, line[2], limit, slots))
 
 
@@ -269,16 +269,16 @@ def column_sums(sites: Bools) -> Ints:
 
 @helper_kernel(f"{GROWING_PLAN}({GROWING_PLAN}, bool_[:, ::1], {SITES})")
 def unlock_row(plan: GrowingPlan, atoms: Bools, spare: Ints) -> GrowingPlan:
-    """Move an atom within its column, the shortest way after which a row can give a column what it lacks.
+    """Move an atom the shortest way within its column so that a row can then fill a column's vacancy.
 
-    Needed when columns lack atoms, yet no row holds both an atom to spare and a vacancy to fill. In the rows
-    with such a vacancy the columns with atoms to spare are then empty too, and the nearest of their atoms has
-    a free path there. Where there is no such move the plan stays as it is.
+    This is needed if columns lack atoms, but no row has both a spare atom and a vacancy to fill. In rows with
+    such a vacancy the columns with spare atoms are then empty too, and the nearest of their atoms has a free
+    path there. If there is no such move the plan stays the same.
 
     Args:
         plan: The plan.
-        atoms: bool (n_rows, n_cols); updated.
-        spare: int64 (n_cols,), atoms that each column can spare; below 0: that it lacks.
+        atoms: bool (n_rows, n_cols), updated.
+        spare: int64 (n_cols,), number of spare atoms of each column. Negative for missing atoms.
     """
     n_rows, n_cols = atoms.shape
     lacking = np.zeros(n_rows, np.bool_)

@@ -1,4 +1,4 @@
-"""Checking, comparing and following plans, and what planners are expected to give."""
+"""Checking, comparing and following plans, and predictions for planners."""
 
 from __future__ import annotations
 

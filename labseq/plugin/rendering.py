@@ -1,4 +1,4 @@
-"""From tones to the samples of an AWG."""
+"""Conversion of tones to the samples of an AWG."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Serial ports, and devices that are switched off over one."""
+"""Serial ports, and devices that are switched off over a serial port."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = [
 
 
 def port_identities(port: str) -> tuple[str, ...]:
-    """The names of a serial port that only one process can use: its own, and that which a link leads to.
+    """The names of a serial port for its lock: its own name, and the target if it is a link.
 
     Example:
         >>> port_identities("socket://Box:4001")
@@ -49,11 +49,11 @@ class Port(Protocol):
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that have come and were not read."""
+        """Number of received bytes that have not been read."""
         ...
 
     def read(self, size: int = 1, /) -> bytes:
-        """The bytes that have come, at most ``size``; waits a little for the first."""
+        """The received bytes, at most ``size``. Waits a little for the first."""
         ...
 
     def write(self, data: bytes, /) -> int | None:
@@ -61,7 +61,7 @@ class Port(Protocol):
         ...
 
     def reset_input_buffer(self) -> None:
-        """Drop the bytes that have come."""
+        """Drop the received bytes."""
         ...
 
     def close(self) -> None:
@@ -78,19 +78,19 @@ def _broken() -> tuple[type[BaseException], ...]:
 
 
 BROKEN: Final = _broken()
-"""Errors of a port whose line is gone; pyserial's own are OSErrors."""
+"""Errors of a port whose line is gone. Pyserial's own errors are OSErrors."""
 
 
 def open_port(port: str, device: str, baud_rate: int, **options: Any) -> Port:
-    """Open a port, alone.
+    """Open a port for exclusive use.
 
     Reads wait for the first byte for at most 20 ms, so that a driver sees a stop request.
 
     Args:
-        port: "/dev/ttyUSB0", "COM3", or a URL that pyserial knows, which cannot be locked.
+        port: "/dev/ttyUSB0", "COM3", or a URL that pyserial knows. A URL cannot be locked.
         device: Name of the instrument, for messages.
         baud_rate: Bits per second.
-        **options: Further ones of pyserial.
+        **options: Further options of pyserial.
 
     Raises:
         DeviceError: There is no such port, or another program has it open.
@@ -102,7 +102,7 @@ def open_port(port: str, device: str, baud_rate: int, **options: Any) -> Port:
     if "://" in port:
         options.pop("write_timeout", None)
     else:
-        # two programs on a port would get each other's replies
+        # two programs on a port would receive each other's replies
         options["exclusive"] = True
     try:
         return serial.serial_for_url(port, baudrate=baud_rate, timeout=SLICE_S, **options)
@@ -115,16 +115,16 @@ class SerialMessage:
     """A message that makes a device safe, or a question.
 
     Attributes:
-        send: What is sent, with its end.
-        until: The end of the reply; "" if none comes.
-        within_s: How long the reply may take, or the pause after a message without one, in seconds.
+        send: The text to send, with its end.
+        until: The end of the reply. "" if none comes.
+        within_s: Longest time for the reply, or the pause after a message without reply, in seconds.
         expect: Pattern of the reply, without its end and surrounding spaces.
-        error: Pattern of a reply that reports an error; None if there is none.
-        value: Of a question: what the group ``value`` of the reply must be.
-        choices: All that it may be; empty for anything.
-        repeatable: Whether it may be sent again if something failed.
-        unless: Questions. It is not sent if all of them are answered as they must be; a toggle is not sent to
-            what is off. After it was sent they must be.
+        error: Pattern of a reply that reports an error. None if there is none.
+        value: For a question, the required group ``value`` of the reply.
+        choices: All possible values. Empty for any value.
+        repeatable: Whether it may be sent again after a failure.
+        unless: Questions. If all have the required answers, the message is not sent, so that a toggle does
+            not turn an output on again. After it was sent, all must have them.
     """
 
     send: str
@@ -141,13 +141,13 @@ class SerialMessage:
 def serial_emergency(
     port: Port, messages: Sequence[SerialMessage], encoding: str = "latin-1", *, echo: bool = False
 ) -> Emergency | None:
-    """The emergency of a device on a serial line: another process opens the port and sends messages.
+    """The emergency of a device on a serial line, for which another process opens the port.
 
     Args:
         port: The open port.
-        messages: What is sent.
-        encoding: Of the characters.
-        echo: Whether the device repeats what it is sent.
+        messages: The messages to send.
+        encoding: Encoding of the characters.
+        echo: Whether the device repeats the messages.
 
     Returns:
         None if there is nothing to send, or no real port, as in a simulation.
@@ -160,14 +160,14 @@ def serial_emergency(
     options = {key: getattr(serial, key, None) for key in keys}
     set_options = {key: value for key, value in options.items() if value is not None}
     if "://" not in name:
-        set_options["write_timeout"] = 1.0  # a device that takes no bytes must not block this
+        set_options["write_timeout"] = 1.0  # a device that takes no bytes must not block the process
     values = [asdict(message) for message in messages]
     arguments = {"port": name, "options": set_options, "messages": values, "encoding": encoding, "echo": echo}
     return Emergency(Path(__file__).with_name("serial_emergency.py"), arguments)
 
 
 def is_network_port(url: str) -> bool:
-    """Whether a URL names a host and a port; pyserial's own message for one that does not makes no sense."""
+    """Whether a URL names a host and a port, because pyserial's own message for others is misleading."""
     try:
         parts = urlsplit(url)
         return bool(parts.hostname) and bool(parts.port)
@@ -176,13 +176,13 @@ def is_network_port(url: str) -> bool:
 
 
 def is_write_timeout(error: BaseException) -> bool:
-    """Whether a write only took too long: the line is not broken."""
+    """Whether a write only took too long, so that the line is not broken."""
     serial: Any = importlib.import_module("serial")
     return isinstance(error, serial.SerialTimeoutException)
 
 
 def ports_here() -> list[Any]:
-    """The ports of this computer, as pyserial describes them: device, vid, pid, serial_number."""
+    """The ports of this computer, with pyserial's attributes device, vid, pid and serial_number."""
     tools: Any = importlib.import_module("serial.tools.list_ports")
     return sorted(tools.comports())
 
@@ -207,7 +207,7 @@ def _reason(error: BaseException) -> str:
     if number == errno.EACCES:
         return "permission denied; ask to be added to the group that owns it (often 'dialout')"
     if number == errno.ENOENT or "FileNotFoundError" in message:
-        return f"there is no such port; expected {ports_text()}; is it plugged in, and switched on?"
+        return f"there is no such port (expected {ports_text()}); check that it is plugged in and on"
     cause = error.__context__  # termios' own, which has its number among its arguments
     if number == errno.EISDIR or (cause is not None and errno.ENOTTY in cause.args):
         return f"it is not a serial port; expected {ports_text()}"

@@ -1,7 +1,7 @@
 """Switches a device on a serial line off from another process, with pyserial alone.
 
-The watchdog loads this file by its path when the run that used the device has died; see
-``labseq.plugin.serial.serial_emergency``. Messages are ``SerialMessage``s as JSON values.
+The watchdog loads this file by its path after the run that used the device has died (see
+``labseq.plugin.serial.serial_emergency``). Messages are ``SerialMessage``s as JSON values.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from typing import Any, Final
 SLICE_S: Final = 0.005
 """Longest single wait for a byte, in seconds."""
 _DIFFERS: Final = "not as commanded: "
-"""Beginning of a failure whose reply was a value, but another one than expected."""
+"""Beginning of a failure in which the reply was another value than expected."""
 _sent: Final[dict[int, str]] = {}
-"""Messages that are not sent again, by index -> why they failed; "" if they did not."""
+"""Index of each message that is not sent again -> why it failed, or "" if it did not."""
 
 
 def prepare(**_: Any) -> None:
-    """Load pyserial; the port is not touched."""
+    """Load pyserial, without using the port."""
     importlib.import_module("serial")
 
 
 def off(
     port: str, options: Mapping[str, Any], messages: Sequence[Mapping[str, Any]], encoding: str, echo: bool
 ) -> str:
-    """Open the port and send every message, also after one that fails.
+    """Open the port and send every message, even if some fail.
 
-    Called again, it sends only what may be repeated.
+    A second call sends only repeatable messages.
 
     Args:
         port: The port, as pyserial knows it.
-        options: Those of the port.
-        messages: What is sent.
-        encoding: Of the characters.
-        echo: Whether the device repeats what it is sent.
+        options: Options of the port.
+        messages: The messages to send.
+        encoding: Encoding of the characters.
+        echo: Whether the device repeats the messages.
 
     Returns:
-        What was sent.
+        The sent messages, as text.
 
     Raises:
         OSError: The port cannot be opened, or messages failed.
@@ -74,7 +74,7 @@ class _Line:
         self._port, self._encoding, self._echo = port, encoding, echo
 
     def carry_out(self, message: Mapping[str, Any]) -> tuple[str, bool]:
-        """Send a message if it must be; returns why it failed, and whether it was sent."""
+        """Send a message if necessary, and return why it failed and whether it was sent."""
         questions = message["unless"]
         answers = [self._ask(question) for question in questions]
         if questions and not any(answers):
@@ -91,10 +91,10 @@ class _Line:
         return failure, True
 
     def _ask(self, message: Mapping[str, Any]) -> str:
-        """Send a message and check the reply; returns what is wrong with it."""
+        """Send a message and check the reply. Returns the error in the reply, or ""."""
         shown, within_s = _shown(message["send"]), message["within_s"]
         sent, end = (message[key].encode(self._encoding) for key in ("send", "until"))
-        self._port.reset_input_buffer()  # a reply that came late must not count as that to this message
+        self._port.reset_input_buffer()  # a late reply must not count as the reply to this message
         self._port.write(sent)
         self._port.flush()
         if not end:

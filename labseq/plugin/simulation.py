@@ -1,4 +1,4 @@
-"""What simulated devices pass to a simulation that acts on their outputs."""
+"""Data that simulated devices pass to a simulation that acts on their outputs."""
 
 from __future__ import annotations
 

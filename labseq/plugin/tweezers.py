@@ -28,7 +28,7 @@ Amplitudes: TypeAlias = tuple[Floats, Floats]
 """Amplitudes of the row tones (n_rows,) and of the column tones (n_cols,), fractions of full scale."""
 
 ROUNDING: Final = 1e-9
-"""Amount by which rounding may bring a sum of amplitudes above its limit."""
+"""Amount by which rounding may raise a sum of amplitudes above its limit."""
 REALS: Final = const("float64", 1)
 
 
@@ -39,7 +39,7 @@ def check_tone_program(
     column_band_hz: tuple[float, float],
     most: float = 1.0,
 ) -> None:
-    """Refuse a tone program that must not reach the outputs, whatever produced it.
+    """Refuse a tone program that must not reach the outputs, whatever made it.
 
     Args:
         name: Name of the device, for the message.
@@ -49,8 +49,7 @@ def check_tone_program(
         most: Largest sum of the amplitudes of an axis, of full scale.
 
     Raises:
-        LimitError: The program has no length, leaves an AOD's band, clips, or has values that are
-            not finite.
+        LimitError: The program has no length, leaves an AOD's band, clips, or has values that are not finite.
     """
     durations = program.duration_s
     if not (np.isfinite(durations).all() and (durations >= 0).all()):
@@ -62,7 +61,7 @@ def check_tone_program(
         ("column", program.column, column_band_hz),
     ):
         tones = axis.start_hz, axis.end_hz, axis.start_amplitude, axis.end_amplitude, axis.phase_rad
-        # one pass by a kernel; which tone it is, is found out only for the error
+        # one pass by a kernel, because only the error needs the number of the tone
         if not is_within(*tones, axis.offsets, *band_hz, most + ROUNDING):
             raise _excess(name, axis_name, axis, program.batch, band_hz, most)
 
@@ -75,7 +74,7 @@ def _excess(
     band_hz: tuple[float, float],
     most: float,
 ) -> LimitError:
-    """The error for the first tone that is out of its limits, or for amplitudes too high together."""
+    """The error for the first tone outside of its limits, or for a sum of amplitudes that is too high."""
     band = f"the AOD's band, {band_hz[0] / 1e6:.6g} to {band_hz[1] / 1e6:.6g} MHz"
     amplitudes, full = (axis.start_amplitude, axis.end_amplitude), "of full scale"
     for quantity, values_at_ends, (least, greatest), scale, unit, limit in (
@@ -96,7 +95,7 @@ def _excess(
     sums = np.diff(running[:, axis.offsets]).max(axis=0)
     segment = int(sums.argmax())
     quantity_name = f"{name}: sum of the {axis_name} amplitudes in segment {segment} (batch {batch[segment]})"
-    return LimitError(quantity_name, f"{sums[segment]:.9g} {full}", f"{most:g}: the output would clip")
+    return LimitError(quantity_name, f"{sums[segment]:.9g} {full}", f"{most:g}, above which the output clips")
 
 
 @kernel(
@@ -122,7 +121,7 @@ def is_within(
 
 
 def calibrated_amplitudes(context: Context) -> Amplitudes:
-    """The amplitudes of the active calibration; without one all are equal and add up to full scale."""
+    """The amplitudes of the active calibration, or equal amplitudes with a sum of full scale."""
     calibration = context.calibrations.get("tweezers")
     if calibration is None:
         return tuple(np.full(n, 1 / n) for n in context.grid.shape)  # pyright: ignore[reportReturnType]
@@ -133,7 +132,7 @@ def check_amplitudes(name: str, amplitudes: Amplitudes, shape: tuple[int, int]) 
     """Refuse amplitudes of static tweezers unless there is one of 0 or more for each of (n_rows, n_cols).
 
     Raises:
-        LimitError: They are of another number, negative or not finite.
+        LimitError: Their number is wrong, or one is negative or not finite.
     """
     for axis, values, n_tones in zip(("row", "column"), amplitudes, shape, strict=True):
         if values.shape != (n_tones,):
@@ -143,9 +142,9 @@ def check_amplitudes(name: str, amplitudes: Amplitudes, shape: tuple[int, int]) 
 
 
 def calibrated_weights(context: Context) -> Floats:
-    """Weight of each site by the active calibration, float64 (n_rows, n_cols), with a mean of 1.
+    """Weight of each site in the active calibration, float64 (n_rows, n_cols), with a mean of 1.
 
-    All are 1 without a calibration, and with that of an array of tones, which says nothing of the sites.
+    All are 1 without a calibration, and for an array of tones, whose calibration has no weights of sites.
     """
     calibration = context.calibrations.get("tweezers")
     weights = None if calibration is None else calibration.values.get("weights")
@@ -156,7 +155,7 @@ def check_weights(name: str, weights: Floats, shape: tuple[int, int]) -> None:
     """Refuse weights of static tweezers unless there is one above 0 for each of (n_rows, n_cols).
 
     Raises:
-        LimitError: They are of another shape, not above 0 or not finite.
+        LimitError: Their shape is wrong, or one is not above 0 or not finite.
     """
     if weights.shape != shape:
         raise LimitError(f"{name}: shape of the weights", weights.shape, shape)
@@ -165,10 +164,10 @@ def check_weights(name: str, weights: Floats, shape: tuple[int, int]) -> None:
 
 
 def check_ramp(name: str, depth: float, duration_s: float, deepest: float) -> None:
-    """Refuse a ramp of static tweezers to a depth, or of a duration, that they cannot have.
+    """Refuse a ramp of static tweezers to an impossible depth, or with an impossible duration.
 
     Raises:
-        LimitError: It is one of these.
+        LimitError: The depth or the duration is impossible.
     """
     if not 0 <= depth <= deepest:
         raise LimitError(f"{name}: depth", f"{depth:g} of the nominal depth", f"0 to {deepest:g} of it")

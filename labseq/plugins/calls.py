@@ -1,4 +1,4 @@
-"""Calls of plugin code outside of a run: while it is loaded, validates settings or constructs."""
+"""Calls of plugin code outside of a run, which load it, validate settings or construct objects."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MAX_PRINTED: Final = 60
-"""Maximum number of characters of a plugin's printed text that are quoted."""
+"""Maximum number of characters of a plugin's printed text in a message."""
 
 
 _guard = Guard()
-"""Its threads, one for each plugin, stay: starting one takes longer than most calls."""
+"""Its threads, one for each plugin, are kept, because starting a thread takes longer than most calls."""
 
 
 def _renew_guard() -> None:
-    """A forked process has none of these threads."""
-    global _guard  # noqa: PLW0603 - a guard is no constant, but there is one in a process
+    """Replace the guard in a forked process, which has none of its threads."""
+    global _guard  # noqa: PLW0603 - a guard is not a constant, but a process has only one
     _guard = Guard()
 
 
@@ -41,18 +41,18 @@ if hasattr(os, "register_at_fork"):
 def call_plugin(owner: Owner, code_name: str, work: Callable[[], T]) -> T:
     """Run code of a plugin, and name the plugin in any error.
 
-    The code runs in another thread: if it hangs it is abandoned after ``owner.max_wait_s``, and a
-    ``SystemExit`` or ``KeyboardInterrupt`` that it raises ends nothing else. Its prints go to stderr,
+    The code runs in another thread. If it hangs it is abandoned after ``owner.max_wait_s``, and a
+    ``SystemExit`` or ``KeyboardInterrupt`` that it raises ends nothing else. Printed text goes to stderr,
     because a program may read JSON from stdout, and is recorded with the owner.
 
     Args:
-        code_name: Name of the code for messages; "" for the loading of the plugin.
+        code_name: Name of the code for messages. "" for the loading of the plugin.
 
     Returns:
-        What the code returned.
+        The result of the code.
 
     Raises:
-        PluginLoadError: The code raised, or did not return in time.
+        PluginLoadError: The code raised another error, or did not return in time.
         LabseqError: The code raised one of labseq's own errors.
     """
     printed = _PrintsToStderr(sys.stdout)
@@ -62,10 +62,10 @@ def call_plugin(owner: Owner, code_name: str, work: Callable[[], T]) -> T:
     finally:
         if text := printed.end():
             when = f"in {code_name}" if code_name else "while it was loaded"
-            advice = "this went to stderr: use 'logging.getLogger(__name__)'"
-            owner.note(f"{when} it printed ('{text[:MAX_PRINTED]}'); {advice}")
+            advice = "use 'logging.getLogger(__name__)' instead"
+            owner.note(f"{when} it printed '{text[:MAX_PRINTED]}' to stderr; {advice}")
     if call is None:
-        _guard.end()  # so that its thread does, too, should the call ever return
+        _guard.end()  # so that its thread also ends if the call ever returns
         fault = f"{code_name} did not return" if code_name else "it did not finish loading"
         remedy = "if it is only slow, raise 'timeouts: {load: ...}' in the profile"
         raise owner.fault(f"{fault} within {owner.max_wait_s:.3g} s and was abandoned; {remedy}")
@@ -77,7 +77,7 @@ def call_plugin(owner: Owner, code_name: str, work: Callable[[], T]) -> T:
 class _PrintsToStderr:
     """Replaces ``sys.stdout`` while a plugin's code runs.
 
-    A plugin may keep it, for example in a logging handler; afterwards it writes to the real stdout.
+    A plugin may keep it, for example in a logging handler. Later it writes to the real stdout.
     """
 
     def __init__(self, real: Any) -> None:
@@ -91,7 +91,7 @@ class _PrintsToStderr:
         return len(text) if self._stream is None else self._stream.write(text)
 
     def end(self) -> str:
-        """Restore the real stdout; returns the beginning of the printed text, on one line."""
+        """Restore the real stdout, and return the beginning of the printed text on one line."""
         self._is_over = True
         return " ".join(self._text.split())
 
@@ -115,7 +115,7 @@ def _plugin_error(owner: Owner, code_name: str, error: BaseException) -> LabseqE
 
 
 def error_location(error: BaseException, home: Path | None) -> str:
-    """File and line that an error came from, in the plugin's own code if possible; "" if unknown."""
+    """File and line of an error, in the plugin's own code if possible. "" if unknown."""
     if isinstance(error, SyntaxError) and error.filename:
         return f"{error.filename}:{error.lineno or 1}"
     chain = [error]
@@ -125,7 +125,7 @@ def error_location(error: BaseException, home: Path | None) -> str:
     plugin_frames = [
         f for f in frames if home is not None and home in (Path(f.filename), *Path(f.filename).parents)
     ]
-    # the lines that call a factory say nothing of the plugin: they are all there is if its signature is wrong
+    # if a factory's signature is wrong, the only lines are labseq's own, which do not concern the plugin
     package = Path(__file__).parents[1]
     callers = {package / "assembly", package / "plugins", package / "guard.py"}
     other_frames = [f for f in frames if not {Path(f.filename), Path(f.filename).parent} & callers]

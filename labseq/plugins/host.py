@@ -41,29 +41,29 @@ def check_api(module: ModuleType, owner: Owner) -> None:
     """Raise for a plugin that was written for another plugin API version.
 
     Raises:
-        PluginLoadError: The versions differ; says what to do.
+        PluginLoadError: The versions differ. The message says what to do.
     """
     written_for: object = getattr(module, "LABSEQ_API", None)
     if type(written_for) is int and written_for == LABSEQ_API:
         return
-    this_labseq = f"this labseq has LABSEQ_API = {LABSEQ_API}"
+    this_labseq = f"but this labseq has LABSEQ_API = {LABSEQ_API}"
     if written_for is None:
         remedy = f"write 'LABSEQ_API = {LABSEQ_API}' at its top"
-        raise owner.fault(f"it does not state LABSEQ_API; {this_labseq}; {remedy}")
+        raise owner.fault(f"it does not state LABSEQ_API; {remedy}")
     fault = f"it was written for LABSEQ_API {written_for!r:.100}"
     if type(written_for) is not int:
-        raise owner.fault(f"{fault}, which is not a whole number; {this_labseq}")
+        raise owner.fault(f"{fault}, which is not a whole number, {this_labseq}")
     remedy = "update labseq, or take an older version of the plugin"
     if written_for < LABSEQ_API:
         remedy = "take a newer version of the plugin, or adapt it (the changelog says what has changed)"
-    raise owner.fault(f"{fault}; {this_labseq}; {remedy}")
+    raise owner.fault(f"{fault}, {this_labseq}; {remedy}")
 
 
 def hooks_of(module: ModuleType, owner: Owner) -> Hooks:
     """The hooks that a plugin implements.
 
     Raises:
-        PluginLoadError: It implements none, or one that labseq cannot call; says what to change.
+        PluginLoadError: It implements no hook, or one with an error. The message says what to change.
     """
     hooks: Hooks = {}
     unmarked: list[str] = []
@@ -111,7 +111,7 @@ LOCAL_PACKAGE: Final = "labseq_local"
 
 
 def plugin_files(folder: Path) -> list[Path]:
-    """The modules in a folder of plugins, and the ``__init__.py`` of the packages in it.
+    """The modules and the ``__init__.py`` of packages in a folder of plugins.
 
     Raises:
         OSError: The folder cannot be read.
@@ -132,7 +132,7 @@ def import_file(name: str, path: Path) -> ModuleType:
         sys.modules[LOCAL_PACKAGE] = ModuleType(LOCAL_PACKAGE)
         sys.modules[LOCAL_PACKAGE].__path__ = []
     full_name = f"{LOCAL_PACKAGE}.{name}"
-    path = path.absolute()  # Python remembers where a relative folder once was
+    path = path.absolute()  # because Python remembers the original location of a relative folder
     inside = [str(path.parent)] if path.name == "__init__.py" else None
     spec = importlib.util.spec_from_file_location(full_name, path, submodule_search_locations=inside)
     if spec is None or spec.loader is None:
@@ -158,7 +158,7 @@ def plugin_location(path: Path) -> Path:
 
 
 def module_location(name: str) -> Path | None:
-    """The folder of an installed package, or its file; None if unknown. Nothing is imported."""
+    """The folder of an installed package, or its file. None if unknown. Nothing is imported."""
     try:
         spec = importlib.util.find_spec(name.partition(".")[0])
     except (ImportError, ValueError, AttributeError):
@@ -171,13 +171,13 @@ class PluginInfo:
     """A plugin, and whether it was loaded.
 
     Attributes:
-        name: Import name; without the prefix ``labseq_local.`` if the plugin is from a folder.
-        origin: "built in", "installed" or the file it came from.
+        name: Import name, without the prefix ``labseq_local.`` if the plugin is from a folder.
+        origin: "built in", "installed" or its file.
         version: Version of its distribution, or "".
-        state: "loaded", "failed" or, for one in ``./plugins`` that nothing names, "not loaded".
+        state: "loaded", "failed", or "not loaded" for a plugin in ``./plugins`` that nothing names.
         reason: Why it failed or was not loaded, or "".
-        source: Its file or its distribution, as text; "" for labseq's own.
-        notes: Text that it printed when it was loaded or in a constructor, a sentence each.
+        source: Its file or its distribution, as text. "" for labseq's own plugins.
+        notes: Sentences about text that it printed when it was loaded or in a constructor.
     """
 
     name: str
@@ -190,14 +190,14 @@ class PluginInfo:
 
 
 class UsedPlugin(NamedTuple):
-    """A plugin that something in a run comes from.
+    """A plugin that a run uses.
 
     Attributes:
-        name: Its name, as of :class:`PluginInfo`.
-        origin: "built in", "installed" or the absolute path of the file it came from.
+        name: Its name, as in :class:`PluginInfo`.
+        origin: "built in", "installed" or the absolute path of its file.
         version: Version of its distribution, or "".
-        home: The file or the folder that its code is in; None if that is not known.
-        offers: What is used of it, for example "planner psca" or "step load"; "observer" for its hooks.
+        home: File or folder of its code. None if unknown.
+        offers: Its parts in use, for example "planner psca" or "step load", or "observer" for its hooks.
     """
 
     name: str
@@ -213,12 +213,12 @@ class UsedPlugin(NamedTuple):
 
     @property
     def is_from_folder(self) -> bool:
-        """Whether it was found in a folder, and is imported again when it is loaded again."""
+        """Whether it comes from a folder, so that loading it again imports it again."""
         return self.origin not in (_BUILT_IN, _INSTALLED)
 
 
 class _HookManager(pluggy.PluginManager):
-    """Looks for hooks only among functions with their mark, which is faster than examining a whole module."""
+    """Examines only marked functions for hooks, which is faster than examining a whole module."""
 
     def parse_hookimpl_opts(self, plugin: object, name: str) -> pluggy.HookimplOpts | None:
         if getattr(vars(plugin).get(name), _MARK, None) is None:
@@ -251,17 +251,17 @@ class PluginHost:
 
     @property
     def notes(self) -> list[str]:
-        """Text that the plugins in use printed when they were loaded and constructed, a sentence each."""
+        """Sentences about text that the plugins in use printed when they were loaded and constructed."""
         used = {*self.registry.used.values()}
         infos = [info for info in self._infos.values() if info.name in used]
         return [f"plugin '{info.name}' ({info.source}): {note}" for info in infos for note in info.notes]
 
     def used(self, also: Collection[str] = ()) -> list[UsedPlugin]:
-        """The plugins that files name, that these build on, or that observe runs, in the order of loading.
+        """The plugins that files name, their base plugins and observers of runs, in the order of loading.
 
         Args:
-            also: Names of others that are wanted; one that another plugin builds on is not known to be used
-                before that is constructed.
+            also: Names of further plugins. A base plugin is only known to be used after the plugin that
+                builds on it is constructed.
         """
         offers = defaultdict[str, set[str]](set, {name: set[str]() for name in also})
         for (kind, name), origin in self.registry.used.items():
@@ -286,7 +286,7 @@ class PluginHost:
         """The plugins in ``./plugins`` that were not loaded, because nothing names the folder."""
         with suppress(OSError):
             files = [path for path in plugin_files(Path(PLUGINS)) if self._is_new(path)]
-            reason = f"use --plugins {PLUGINS}; files name the folder in 'plugin_folders: [{PLUGINS}]'"
+            reason = f"use --plugins {PLUGINS}, or write 'plugin_folders: [{PLUGINS}]' in a file"
             return [
                 PluginInfo(plugin_name(path), str(path), "", "not loaded", reason, str(path))
                 for path in files
@@ -294,13 +294,13 @@ class PluginHost:
         return []
 
     def load_builtin(self, module: ModuleType) -> None:
-        """Register a module of labseq itself; its failure is a bug in labseq and raises."""
+        """Register a module of labseq itself. Its failure is a bug in labseq and raises."""
         info = PluginInfo(module.__name__, _BUILT_IN, __version__)
         self._run_code(info, None, lambda: module)
         self._infos[info.name] = info
 
     def load_entry_points(self) -> None:
-        """Load every installed plugin; each failure is kept for the report."""
+        """Load every installed plugin. Failures are kept for the report."""
         for point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
             name, version = ("", "") if point.dist is None else name_and_version(point.dist)
             source = f"the distribution {name or 'unknown'} {version}".rstrip()
@@ -308,7 +308,7 @@ class PluginHost:
             self._load(info, module_location(point.value.partition(":")[0]), point.load)
 
     def load_folders(self, folders: Sequence[Path]) -> None:
-        """Load single files and packages from folders, and from those of --plugins and LABSEQ_PLUGIN_PATH.
+        """Load files and packages from folders, including --plugins and LABSEQ_PLUGIN_PATH.
 
         Raises:
             ConfigError: A folder does not exist, or cannot be read.
@@ -327,7 +327,7 @@ class PluginHost:
                 self._load_path(path)
 
     def import_all(self) -> None:
-        """Import all that the plugins offer; each failure is kept for the report."""
+        """Import everything that the plugins offer. Failures are kept for the report."""
         for info in self.infos:
             try:
                 self.registry.entries(info.name)
@@ -341,15 +341,15 @@ class PluginHost:
             return
         info = PluginInfo(name, str(path), source=str(path))
         if not name.isidentifier():
-            reason = "its name is not a Python name: letters, digits and '_' only; rename it"
+            reason = "its name is not a Python name; rename it with only letters, digits and '_'"
             self._infos[name] = replace(info, state="failed", reason=reason)
             return
         self._load(info, plugin_location(path), partial(import_file, name, path))
-        if self._infos[name].state == "failed":  # else the modules are those of a plugin that works
+        if self._infos[name].state == "failed":  # otherwise the modules belong to a working plugin
             forget(name)
 
     def _load(self, info: PluginInfo, home: Path | None, importing: Callable[[], ModuleType]) -> None:
-        """Load a plugin; whether it failed, and why, is in the report."""
+        """Load a plugin. A failure and its reason are kept for the report."""
         if info.name in self._infos:
             taken = self._infos[info.name]
             other_plugin = f"the plugin in {taken.origin}"
@@ -367,10 +367,10 @@ class PluginHost:
         self._infos[info.name] = info
 
     def _run_code(self, info: PluginInfo, home: Path | None, importing: Callable[[], ModuleType]) -> None:
-        """Import a plugin, check it and have it register what it offers; of one that fails nothing stays.
+        """Import a plugin, check it and let it register its offers. A failing plugin leaves nothing behind.
 
         Args:
-            home: The file or the folder that its code is in; None if that is not known.
+            home: File or folder of its code. None if unknown.
             importing: Imports it.
         """
         self._homes[info.name] = home
@@ -385,17 +385,17 @@ class PluginHost:
                     hooks["labseq_register"](registry=registry)
                 return module
 
-            # in one guarded call, so that the time limit is for all of it
+            # in one guarded call, so that the time limit applies to all of it
             self._pluggy.register(call_plugin(owner, "", run), info.name)
 
     def _is_new(self, path: Path) -> bool:
-        """Whether a file is neither a plugin that was found already nor an installed library."""
+        """Whether a file is neither a known plugin nor an installed library."""
         files = {getattr(plugin, "__file__", None) for plugin in self._pluggy.get_plugins()}
         files |= {info.source for info in self._infos.values()}
         resolved = path.resolve()
         if any(file and Path(file).resolve() == resolved for file in files):
             return False
-        # what Python imports from this folder anyway is a library beside the plugins, unless it states that
+        # modules that Python imports from this folder anyway are libraries, unless they state LABSEQ_API
         is_library = module_location(plugin_name(path)) == plugin_location(path)
         return not is_library or b"LABSEQ_API" in path.read_bytes()
 
@@ -406,9 +406,9 @@ class PluginHost:
             file: The file that names it, for messages.
 
         Raises:
-            PluginLoadError: The plugin of that name was found but did not load, or two plugins
-                offer the name.
-            UnknownPluginError: No plugin offers it.
+            PluginLoadError: The plugin of that name was found but did not load, or two plugins offer the
+                name.
+            UnknownPluginError: No plugin offers the name.
         """
         if (kind, name) in self.registry.contested:
             raise self.registry.contested[kind, name]
@@ -432,7 +432,7 @@ class PluginHost:
 
 
 def name_and_version(distribution: importlib.metadata.Distribution) -> tuple[str, str]:
-    """Name and version of an installed package, or ""; parsing all of its metadata would take long."""
+    """Name and version of an installed package, or "". Parsing all metadata would take too long."""
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
     head = text.partition("\n\n")[0]
     fields = dict(re.findall(r"^(Name|Version): *(.*?) *$", head, re.MULTILINE))

@@ -58,15 +58,15 @@ def new(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="A measurement that comes with labseq, with which a new sequence begins: rabi, ramsey, "
-            "lifetime, release_recapture, trap_depth, ...",
+            help="A measurement of labseq from which a new sequence is made, such as rabi, ramsey, "
+            "lifetime, release_recapture or trap_depth.",
             autocompletion=measurements,
         ),
     ] = None,
     folder: Annotated[
         Path,
         typer.Option(
-            metavar="DIR", help="Folder of your sequences and profiles; default: the current folder."
+            metavar="DIR", help="Folder of your sequences and profiles. By default the current folder."
         ),
     ] = Path(),
 ) -> None:
@@ -100,8 +100,8 @@ def schema(
         list[Path] | None,
         typer.Option(
             metavar="DIR",
-            help="Folder of plugins whose settings the schema includes; may be given several times. Default: "
-            "the folder plugins, if it exists.",
+            help="Folder of plugins whose settings the schema includes. May be given several times. By "
+            "default the folder plugins, if it exists.",
         ),
     ] = None,
 ) -> None:
@@ -117,7 +117,7 @@ def explain(
         list[str] | None,
         typer.Argument(
             metavar="WHAT",
-            help="Words such as step image, profile.camera or psca; without any, what there is to explain.",
+            help="Words such as step image, profile.camera or psca. Without words, all topics are listed.",
             show_default=False,
         ),
     ] = None,
@@ -125,7 +125,7 @@ def explain(
 ) -> None:
     """Explain a key of a file, a step, a plugin, a command, a quantity, an error or a unit.
 
-    It is the text of the reference pages, with the installed plugins and those of --plugins.
+    The text is that of the reference pages, with the installed plugins and those of --plugins.
     """
     from labseq.scaffold.reference import explain_topic
 

@@ -1,7 +1,7 @@
-"""`labseq new` and `labseq schema`: plugins, sequences and profiles that run at once; schemas for editors.
+"""`labseq new` and `labseq schema`: new files and plugins that run at once, and schemas for editors.
 
-A template of a plugin consists of sections, each begun by a line ``==> name <==``: ``about`` (what the
-plugin does, in a sentence), the files, and ``use`` (the command that runs a sequence with it).
+A template of a plugin consists of sections, each begun by a line ``==> name <==``. The sections are ``about``
+(a sentence about the plugin), the files, and ``use`` (the command that runs a sequence with it).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ MAX_LENGTH: Final = 40
 FIRST: Final = "first"
 """Name of the sequence that the examples run."""
 PACKAGE_PREFIX: Final = "labseq_"
-"""How the names of plugins that are distributions of their own begin."""
+"""Beginning of the names of plugins with their own distribution."""
 
 _PLUGIN_NAME: Final = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _FILE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9]*([_-][A-Za-z0-9]+)*")
@@ -62,7 +62,7 @@ class CreatedFiles:
     Attributes:
         path: The file, or the plugin's folder.
         files: All files that were written.
-        commands: What to do next, one command line each.
+        commands: The next command lines.
     """
 
     path: Path
@@ -73,7 +73,7 @@ class CreatedFiles:
 def make_new(
     kind: str, name: str, folder: Path, *, package: bool, profile: str | None, like: str | None
 ) -> None:
-    """Make a plugin, a sequence or a profile, and print its files and what to do next."""
+    """Make a plugin, a sequence or a profile, and print its files and the next commands."""
     if kind not in (*ROLES, *FILE_KINDS):
         kinds = (*ROLES, *FILE_KINDS)
         what = f"there is no kind '{clean(kind)}'"
@@ -91,7 +91,7 @@ def make_new(
 
 
 def lines_of(kind: str, name: str, created: CreatedFiles) -> list[str]:
-    """What is printed about the new files.
+    """The printed lines about the new files.
 
     Example:
         >>> lines_of("sequence", "a", CreatedFiles(Path("a.yaml"), (Path("a.yaml"),), ("labseq run a.yaml",)))
@@ -106,14 +106,14 @@ def _called(kind: str) -> str:
 
 
 def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) -> CreatedFiles:
-    """Make a plugin that runs at once: the plugin, its settings, tests of its contract, a README.
+    """Make a plugin that runs at once, with settings, tests of its contract, and a README.
 
     Args:
-        folder: Where sequences and profiles are; the plugin goes into ``plugins`` there.
-        package: Whether to make it a distribution of its own, next to them.
+        folder: Folder of sequences and profiles. The plugin goes into ``plugins`` there.
+        package: Whether to make its own distribution, next to them.
 
     Raises:
-        ConfigError: The name is not allowed or taken, or something cannot be written.
+        ConfigError: The name is not allowed or taken, or a file cannot be written.
     """
     module = name if not package or name.startswith(PACKAGE_PREFIX) else f"{PACKAGE_PREFIX}{name}"
     check_plugin_name(kind, name, module, _plugins_of(folder))
@@ -152,14 +152,14 @@ def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) ->
 
 
 def _refresh_schemas(folder: Path) -> list[Path]:
-    """Write again the schemas that a folder has, because there are other plugins now."""
+    """Update the existing schemas of a folder, because there are other plugins now."""
     kinds: list[FileKind] = [kind for kind in FILE_KINDS if schema_path(kind, folder).is_file()]
     registry = _plugins_of(folder).registry if kinds else Registry()
     return [write_schema(kind, folder, registry) for kind in kinds]
 
 
 def _needed(commands: list[str], folder: Path) -> tuple[str, ...]:
-    """The commands without the one that makes the sequence, if it exists, and with what tests still need."""
+    """The commands, without making a sequence that exists, and with the installation of test tools."""
     has_sequence = (folder / f"{FIRST}.yaml").exists()
     can_test = all(find_spec(module) is not None for module in ("pytest", "hypothesis"))
     install = () if can_test else (install_hint("testing"),)
@@ -172,12 +172,12 @@ def make_file(
     """Make a sequence or a profile that runs at once, and the schema that editors read with it.
 
     Args:
-        name: Its name; the file is ``NAME.yaml``.
+        name: Its name. The file is ``NAME.yaml``.
         profile: The profile that a sequence names.
-        like: Name of a measurement that comes with labseq, with which a sequence begins.
+        like: Name of a measurement of labseq from which the sequence is made.
 
     Raises:
-        ConfigError: The name is not allowed or taken, there is no such profile or measurement, or something
+        ConfigError: The name is not allowed or taken, there is no such profile or measurement, or a file
             cannot be written.
     """
     host = _plugins_of(folder)
@@ -207,7 +207,7 @@ def make_file(
 
 
 def measurement_text(like: str, name: str, profile: str) -> str:
-    """The text of a sequence that measures as one that comes with labseq, with its own name and profile.
+    """The text of a packaged sequence for a measurement, with a new name and profile.
 
     Raises:
         ConfigError: There is no such sequence, or it fits nothing.
@@ -224,10 +224,10 @@ def measurement_text(like: str, name: str, profile: str) -> str:
 
 
 def check_plugin_name(kind: str, name: str, package: str, host: PluginHost) -> None:
-    """Refuse a name that a plugin cannot have, or that is taken.
+    """Refuse a name that is not allowed for a plugin, or is taken.
 
     Raises:
-        ConfigError: The name cannot be used; the message suggests another name.
+        ConfigError: The name cannot be used. The message suggests another name.
     """
     if not _PLUGIN_NAME.fullmatch(name) or len(name) > MAX_LENGTH:
         guess = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_0123456789")[:MAX_LENGTH]
@@ -249,15 +249,15 @@ def check_plugin_name(kind: str, name: str, package: str, host: PluginHost) -> N
 
 
 def check_file_name(kind: str, name: str, profiles: Path) -> None:
-    """Refuse a name that a sequence or profile cannot have.
+    """Refuse a name that is not allowed for a sequence or profile.
 
     Raises:
-        ConfigError: The name cannot be used; the message suggests another name.
+        ConfigError: The name cannot be used. The message suggests another name.
     """
     if not _FILE_NAME.fullmatch(name) or len(name) > MAX_LENGTH:
         guess = re.sub(r"\.ya?ml$", "", name, flags=re.IGNORECASE)
         guess = re.sub(r"[^A-Za-z0-9]+", "_", guess).strip("_0123456789")[:MAX_LENGTH]
-        expected = f"at most {MAX_LENGTH} letters, digits, '-' and '_', beginning with a letter, no ending"
+        expected = f"at most {MAX_LENGTH} letters, digits, '-' and '_', first a letter, without an ending"
         what = "it is not a valid file name"
         raise _name_error(kind, name, what, expected, guess if _FILE_NAME.fullmatch(guess) else "")
     reasons = (
@@ -284,10 +284,10 @@ def _name_error(kind: str, name: str, why: str, expected: str, guess: str) -> Co
 
 
 def _is_installed(package: str) -> bool:
-    """Whether Python finds such a package; a plain folder of that name does not count."""
+    """Whether Python finds such a package. A plain folder of that name does not count."""
     try:
         spec = find_spec(package)
-    except (ImportError, ValueError):  # it is loaded, but by other means than the import system
+    except (ImportError, ValueError):  # it is loaded, but not by the import system
         return True
     return spec is not None and spec.origin is not None
 
@@ -328,7 +328,7 @@ def fill(text: str, words: Mapping[str, str]) -> str:
 
 
 def class_prefix(name: str) -> str:
-    """How the names of a plugin's classes begin.
+    """The beginning of the names of a plugin's classes.
 
     Example:
         >>> class_prefix("my_spiral_2")
@@ -341,7 +341,7 @@ def _write_folder(path: Path, texts: Mapping[str, str]) -> Iterable[Path]:
     """Write a folder completely or not at all.
 
     Raises:
-        OSError: It exists already, or it cannot be written.
+        OSError: The folder exists already, or cannot be written.
     """
     if path.exists() or path.is_symlink():
         raise FileExistsError
@@ -360,14 +360,14 @@ def _write_folder(path: Path, texts: Mapping[str, str]) -> Iterable[Path]:
 
 @contextmanager
 def _reporting(path: Path) -> Generator[None]:
-    """Report what the operating system refuses as an error about a path."""
+    """Report errors of the operating system as errors about a path."""
     try:
         yield
     except FileExistsError:
         hint = "choose another name, or remove it first"
-        raise ConfigError(Problem("it exists already", visible(str(path)), hint=hint)) from None
+        raise ConfigError(Problem("this already exists", visible(str(path)), hint=hint)) from None
     except OSError as error:
-        what = f"it cannot be made: {error.strerror or error}"
+        what = f"this cannot be made ({error.strerror or error})"
         raise ConfigError(Problem(what, visible(str(path)))) from error
 
 

@@ -1,4 +1,4 @@
-"""The reference of what Python code uses: public names, classes with their attributes, contract suites.
+"""The reference for Python code: public names, classes with their attributes, contract suites.
 
 The suites of :mod:`labseq.testing` need pytest, which few computers of a lab have, so they are read from
 their source.
@@ -32,7 +32,7 @@ SCRIPTS: Final = (
 )
 """Functions that scripts and notebooks call."""
 _ALIASES: Final = {
-    "Occupancy": "a boolean array (rows, columns): which sites hold an atom",
+    "Occupancy": "a boolean array (rows, columns), True for sites with an atom",
 }
 """Names whose docstring is not their own."""
 _CONTRACTS: Final = Path(labseq.__file__).parent / "testing" / "contracts"
@@ -50,13 +50,13 @@ def names() -> list[Block]:
 
 
 def summaries(title: str, objects: Mapping[str, Any]) -> Table:
-    """A row per object: its name, and the first line of its docstring."""
+    """A row per object, with its name and the first line of its docstring."""
     rows = [(f"`{name}`", _about(name, item)) for name, item in objects.items()]
     return Table((title, "what it is"), rows)
 
 
 def class_reference(kind: type[Any]) -> list[Block]:
-    """What a class is, a row per property, and a definition per public method."""
+    """The docstring of a class, a row per property, and a definition per public method."""
     rows: list[tuple[str, ...]] = []
     methods: list[Block] = []
     for name in _public(kind):
@@ -87,7 +87,7 @@ def _getter(member: property | cached_property[Any]) -> Any:
 
 
 def contract(name: str) -> list[Block]:
-    """A contract suite: its docstring, and a row for each promise of its own."""
+    """The docstring of a contract suite, and a row for each of its own promises."""
     module, suite = dict(_suites())[name]
     bases = [base.id for base in suite.bases if isinstance(base, ast.Name)]
     inherited = [f"The promises of `{', '.join(bases)}`, and:"] if bases else []

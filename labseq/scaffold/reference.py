@@ -1,6 +1,6 @@
 """The reference: every key, plugin, command, role, event and field of a file, as topics.
 
-A topic is a list of blocks: :func:`plain` writes them for the terminal, docs/make_reference.py for the site.
+A topic is a list of blocks. :func:`plain` writes them for the terminal, docs/make_reference.py for the site.
 The names of topics are words: ``step image``, ``profile grid spacing``, ``command bench planners``.
 """
 
@@ -39,7 +39,7 @@ from labseq.units import EXAMPLES, UNITS, unit_names
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of Markdown cells; the first cell of a row is its name, the last its meaning."""
+    """Rows of Markdown cells. The first cell of a row is its name, the last cell its meaning."""
 
     header: tuple[str, ...]
     rows: Sequence[Sequence[str]]
@@ -47,7 +47,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """A name, or how a function is called, and its text."""
+    """A name or the signature of a function, and its text."""
 
     term: str
     text: str
@@ -55,14 +55,14 @@ class Definition:
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """Lines to be copied."""
+    """Lines to copy."""
 
     language: str
     text: str
 
 
 Block: TypeAlias = str | Table | Definition | Code
-"""A text is Markdown: paragraphs and lists."""
+"""A part of a topic. Text is Markdown with paragraphs and lists."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,8 +70,8 @@ class Topic:
     """Something that can be looked up.
 
     Attributes:
-        about: What it is, on one line.
-        blocks: Makes all that is known of it.
+        about: Its description, on one line.
+        blocks: Makes its full text.
     """
 
     about: str
@@ -106,7 +106,7 @@ def _plain_text(text: str, width: int, indent: str = "") -> list[str]:
 
 
 def _plain_table(table: Table, width: int) -> list[str]:
-    """The name of each row, beside it what it means, and then the cells between them."""
+    """The name of each row, its meaning next to the name, and then the cells between them."""
     rows = [list(map(_unmarked, row)) for row in table.rows]
     room = min(max((len(row[0]) for row in rows), default=0), 26)
     lines: list[str] = []
@@ -155,13 +155,13 @@ _ADDED_BY_LOADER: Final[Mapping[tuple[SettingsType | None, str], str]] = {
     (SequenceSpec, "planner"): f"`{{use: {DEFAULT_PLANNER}}}`",
     (SequenceSpec, "shots"): "required without `scan`",
 }
-"""Keys that the model needs and the loader adds: their defaults, or when they are needed."""
+"""Keys that the model needs but the loader can add -> their defaults, or when they are required."""
 _KEY_HEADER: Final = ("key", "value", "default", "meaning")
 _NO_SETTINGS: Final = "It takes no settings."
 
 
 def settings(model: SettingsType | None, *, top: bool = False) -> Block:
-    """A row per key; the keys of a mapping follow it as ``mapping.key``.
+    """A row per key. The keys of a mapping follow it as ``mapping.key``.
 
     Args:
         top: Leave out the keys of mappings.
@@ -173,7 +173,7 @@ def settings(model: SettingsType | None, *, top: bool = False) -> Block:
 def _keys_of(
     model: SettingsType | None, *, top: bool = False, prefix: str = ""
 ) -> Iterator[tuple[str, SettingsType | None, Setting]]:
-    """Every key of a model with those of the mappings in it, whose key it is, and its description."""
+    """Every key of a model and of its mappings, with the model that owns it and its setting."""
     for setting in settings_of(model):
         key = prefix + setting.key
         yield key, model, setting
@@ -183,7 +183,7 @@ def _keys_of(
 
 
 def _inner_model(setting: Setting) -> SettingsType | None:
-    """The model of a mapping, unless it is a plugin's choice, whose settings are its own."""
+    """The model of a mapping. None for the choice of a plugin, which has its own settings."""
     return next((one for one in setting.models if not issubclass(one, Choice)), None)
 
 
@@ -194,7 +194,7 @@ def _row(key: str, owner: SettingsType | None, setting: Setting) -> tuple[str, .
 
 
 def entry_blocks(entry: Entry) -> list[Block]:
-    """What a plugin offers under a name: what it is, where it comes from, its settings."""
+    """The description, origin and settings of an entry of a plugin."""
     return [_about_entry(entry), settings(entry.settings_model)]
 
 
@@ -210,11 +210,11 @@ def units() -> list[Block]:
 
 
 def definition(function: Callable[..., Any], *, is_value: bool = False, name: str = "") -> Definition:
-    """How a function is called, and its docstring.
+    """The signature and docstring of a function.
 
     Args:
         is_value: Whether it is a property.
-        name: What it is called by, where that is not its own name.
+        name: Name for calls, if it is not its own name.
     """
     signature = inspect.signature(function)
     arguments = [parameter for key, parameter in signature.parameters.items() if key != "self"]
@@ -224,7 +224,7 @@ def definition(function: Callable[..., Any], *, is_value: bool = False, name: st
 
 
 def public(module: Any, is_kind: Callable[[object], bool]) -> list[Any]:
-    """What a module, or a package with its modules, defines for others, in the order of the source."""
+    """The public objects of a module, or of a package with its modules, in the order of the source."""
     members = [
         member for name, member in vars(module).items() if is_kind(member) and not name.startswith("_")
     ]
@@ -243,10 +243,10 @@ def roles_by_name() -> dict[str, type]:
 
 
 def role(role_type: type) -> list[Block]:
-    """What a role is, and a definition per method."""
+    """The docstring of a role, and a definition per method."""
     shared = [base.__name__ for base in role_type.__bases__ if base.__name__ in roles_by_name()]
     blocks: list[Block] = [docstring(role_type)]
-    blocks += [f"All that `{', '.join(shared)}` asks for, and:"] if shared else []
+    blocks += [f"Everything that `{', '.join(shared)}` requires, and:"] if shared else []
     for member in vars(role_type).values():
         function = member.fget if isinstance(member, property) else member
         if inspect.isfunction(function) and not function.__name__.startswith("_"):
@@ -260,7 +260,7 @@ def hooks() -> list[Block]:
 
 
 def errors_by_name() -> dict[str, type[LabseqError]]:
-    """Name -> error, each after the one that it is a kind of."""
+    """Name -> error, each after its base class."""
 
     def walk(error: type[LabseqError]) -> Iterator[type[LabseqError]]:
         yield error
@@ -274,14 +274,14 @@ def error(error_type: type[LabseqError]) -> Definition:
     """An error, its fields and its exit code."""
     code = str(error_type.exit_code)
     if error_type is StopRequested:
-        hang_up = 1  # which Windows does not have
+        hang_up = 1  # Windows does not have this signal
         numbers = (hang_up, int(SIGINT), int(SIGTERM))
         code = ", ".join(str(exit_code_of(StopRequested(number))) for number in numbers)
     return Definition(error_type.__name__, f"{docstring(error_type)}\n\nExit code {code}.")
 
 
 def kinds_of(error_type: type[LabseqError]) -> list[type[LabseqError]]:
-    """The errors that are kinds of an error."""
+    """The subclasses of an error."""
     return [kind for kind in error_type.__subclasses__() if kind.__module__ == errors.__name__]
 
 
@@ -291,7 +291,7 @@ def exit_codes() -> list[Block]:
 
 
 def plan_rules() -> list[Block]:
-    """The rules that every plan is checked against."""
+    """The rules against which every plan is checked."""
     from labseq.motion import RULES
 
     return [_named("rule", RULES)]
@@ -342,7 +342,7 @@ def columns() -> list[Block]:
 
 
 def index_keys() -> list[Block]:
-    """A row per value that a shot's line in the index has of the shot's record."""
+    """A row per value of a shot's record that is in the index."""
     from labseq.recording import schema
 
     rows = [(f"`{field.name}`", field.dtype, field.description) for field in schema.IN_INDEX]
@@ -363,7 +363,7 @@ def words() -> list[Block]:
 
 
 def fits() -> list[Block]:
-    """A row per model that a scan can be fitted with."""
+    """A row per model for fitting a scan."""
     from labseq.data.fit_models import MODELS
 
     return [_named("fit", {name: model.formula for name, model in MODELS.items()})]
@@ -378,7 +378,7 @@ def command(names: Sequence[str], typer_command: Any) -> list[Block]:
     """Usage, arguments, options and examples of a command.
 
     Args:
-        names: ["bench", "planners"]; none for the options of all commands.
+        names: For example ["bench", "planners"]. Empty for the options of all commands.
         typer_command: The command, as typer sees it.
     """
     arguments = [param for param in typer_command.params if param.param_type_name == "argument"]
@@ -434,24 +434,24 @@ def _meaning(typer_command: Any, parameter: Any) -> str:
 
 _TABLES: Final[Mapping[str, tuple[str, Callable[[], list[Block]]]]] = {
     "unit": ("quantities and their units", units),
-    "quantity": ("numbers of each shot: to plot, to optimise in a scan, to watch in a policy", quantities),
-    "field": ("what a shot's HDF5 file has, /entry left out", datasets),
+    "quantity": ("numbers of each shot, to plot, to optimise in a scan or to watch in a policy", quantities),
+    "field": ("contents of a shot's HDF5 file, without /entry", datasets),
     "column": ("columns of the tables in a shot's HDF5 file", columns),
-    "index": ("what a line of index.jsonl has", index_keys),
-    "event": ("what happens in a run, as in events.jsonl", events),
-    "rule": ("rules that every plan is checked against", plan_rules),
+    "index": ("contents of a line of index.jsonl", index_keys),
+    "event": ("events of a run, as in events.jsonl", events),
+    "rule": ("rules against which every plan is checked", plan_rules),
     "exit": ("exit codes of the commands", exit_codes),
     "fit": ("models for the points of a scan", fits),
     "variable": ("environment variables", environment),
     "word": ("words that the commands print: heads of columns, names of rows, stages", words),
 }
-"""First word of topics -> what they are, and a table with a row for each of them."""
+"""First word of topics -> their description, and a table with a row for each topic."""
 _LISTED: Final = {
-    "command": "the commands: their arguments and options",
-    "role": "the methods of a plugin's class, and what they promise",
+    "command": "the commands, with their arguments and options",
+    "role": "the methods of a plugin's class, and their promises",
     "error": "the errors, with their fields",
 }
-"""First word of topics -> what they are; each of them is a topic of its own."""
+"""First word of topics -> their description. Each is a separate topic."""
 
 
 def topics(registry: Registry, program: Any) -> dict[str, Topic]:
@@ -508,7 +508,7 @@ def _offered(entries: Iterable[Entry]) -> list[Block]:
 
 
 def _row_topics(name: str, blocks: Iterable[Block]) -> Iterator[tuple[str, Topic]]:
-    """A topic for each row of the tables; the path of a table stands above it if there are several."""
+    """A topic for each row of the tables. If there are several, the path of a table is above it."""
     group = ""
     for block in blocks:
         if isinstance(block, str):
@@ -532,7 +532,7 @@ def _key_topics(names: tuple[str, ...], model: SettingsType | None) -> dict[str,
 def _key_blocks(
     key: str, owner: SettingsType | None, setting: Setting, further: Iterable[Block] = ()
 ) -> list[Block]:
-    """The row of a key, those of the mapping that it holds, and what else there is."""
+    """The row of a key, the rows of a mapping in it, and further blocks."""
     inner = _inner_model(setting)
     rows = [_row(key, owner, setting)]
     rows += [_row(f"{key}.{name}", model, nested) for name, model, nested in _keys_of(inner)]
@@ -540,7 +540,7 @@ def _key_blocks(
 
 
 def _file_topics(kind: str, registry: Registry) -> dict[str, Topic]:
-    """The keys of a file; those that name a plugin with the plugins that there are."""
+    """The keys of a file, with the available plugins for keys that name a plugin."""
     by_name = _key_topics((kind,), FILES[kind])
     for key, owner, setting in _keys_of(FILES[kind], top=True):
         plugin_kind = key if key in ROLES else _PLUGIN_KINDS.get(key, "")
@@ -556,13 +556,13 @@ def _file_topics(kind: str, registry: Registry) -> dict[str, Topic]:
 
 
 def _choice_blocks(models: Sequence[SettingsType], entries: Sequence[Entry]) -> list[Block]:
-    """The keys beside the name of a plugin, and the plugins."""
+    """The keys next to the name of a plugin, and the plugins."""
     key_tables = [settings(model) for model in models if issubclass(model, Choice)]
-    return [*key_tables, "The plugins, with settings of their own:", *_offered(entries)]
+    return [*key_tables, "The plugins, with their own settings:", *_offered(entries)]
 
 
 def overview(by_name: Mapping[str, Topic], names: Iterable[str] | None = None) -> list[Block]:
-    """A row for each of these topics; by default for those with a name of one word."""
+    """A row for each of these topics, by default for topics with a name of one word."""
     shown = [name for name in by_name if " " not in name] if names is None else names
     return [_named("name", {name: by_name[name].about for name in shown})]
 
@@ -571,10 +571,10 @@ def find(by_name: Mapping[str, Topic], request: str) -> list[str]:
     """The names of the topics that a user means.
 
     Args:
-        request: Words, with spaces or dots between: "step image", "profile.camera", "psca".
+        request: Words separated by spaces or dots, such as "step image", "profile.camera" or "psca".
 
     Returns:
-        One name; several if the words fit several names.
+        One name, or several if the words fit several names.
 
     Raises:
         ConfigError: There is no such topic.
@@ -590,8 +590,8 @@ def find(by_name: Mapping[str, Topic], request: str) -> list[str]:
     near = closest(" ".join(words), (" ".join(key) for key in folded), None) or closest(
         words[-1] if words else "", (key[-1] for key in folded), None
     )
-    hint = f"did you mean '{near}'?" if near else "`labseq explain` lists what there is"
-    raise ConfigError(Problem(f"there is nothing called '{clean(request)}' to explain", hint=hint))
+    hint = f"did you mean '{near}'?" if near else "`labseq explain` lists all topics"
+    raise ConfigError(Problem(f"there is no topic '{clean(request)}' to explain", hint=hint))
 
 
 def _has_in_order(key: tuple[str, ...], words: tuple[str, ...]) -> bool:
@@ -608,17 +608,17 @@ def _folded(name: str) -> tuple[str, ...]:
 
 
 def explain_topic(what: str, program: Any) -> None:
-    """Print what is known of a key, a plugin, a command, ...; without a name, what there is to explain.
+    """Print the explanation of a key, a plugin, a command, ... Without a name, print all topics.
 
     Args:
         program: The command ``labseq``, as typer sees it.
 
     Raises:
-        ConfigError: There is no such thing.
+        ConfigError: There is no such topic.
     """
     host = load_plugins()
     host.import_all()
-    left_out = [f"{info.origin} is not included: use --plugins {PLUGINS}" for info in host.unused()]
+    left_out = [f"{info.origin} is not included; use --plugins {PLUGINS}" for info in host.unused()]
     left_out += [f"{info.name} did not load: {info.reason}" for info in host.infos if info.state == "failed"]
     by_name = topics(host.registry, program)
     width = min(shutil.get_terminal_size().columns, 110)

@@ -1,6 +1,6 @@
 """JSON schemas of sequences and profiles, for editors.
 
-The dialect is draft 7, which every editor reads. A schema contains what is known without context: keys,
+The dialect is draft 7, which every editor reads. A schema contains everything that needs no context: keys,
 types, limits of plain numbers, units. ``labseq check`` checks the rest.
 """
 
@@ -35,7 +35,7 @@ SCHEMA_FOLDER: Final = ".labseq"
 DRAFT: Final = "http://json-schema.org/draft-07/schema#"
 DEFINITIONS: Final = "definitions"
 
-_DIMENSION: Final = "x-dimension"  # of a quantity, until its default is written with a unit
+_DIMENSION: Final = "x-dimension"  # dimension of a quantity, until its default is written with a unit
 _SIGN: Final = "[+-]?"
 _NUMBER: Final = r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
 _EXPRESSION: Final = "^=(?!=)"
@@ -43,7 +43,7 @@ _VALUES: Final = frozenset({"default", "const", "enum", "examples"})
 _MAPS: Final = frozenset({"properties", "patternProperties"})
 _DROPPED: Final = frozenset({"title", "discriminator", "$defs", _DIMENSION})
 _LIMITS: Final = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
-"""pydantic's names for limits that are checked after a validator, and those of JSON schema."""
+"""Pydantic's names for limits that are checked after a validator -> the names of JSON schema."""
 
 
 def schema_text(kind: FileKind, registry: Registry) -> str:
@@ -52,7 +52,7 @@ def schema_text(kind: FileKind, registry: Registry) -> str:
 
 
 def schema_path(kind: FileKind, folder: Path) -> Path:
-    """Where the files of a folder look for their schema."""
+    """Path of the schema for the files of a folder."""
     return folder / SCHEMA_FOLDER / f"{kind}.schema.json"
 
 
@@ -60,7 +60,7 @@ def write_schema(kind: FileKind, folder: Path, registry: Registry) -> Path:
     """Write the schema that files of this kind in a folder name in their first line.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The schema cannot be written.
     """
     path = schema_path(kind, folder)
     path.parent.mkdir(exist_ok=True)
@@ -75,13 +75,13 @@ def file_schema(kind: FileKind, registry: Registry) -> JsonSchema:
 
 
 class _Generator(GenerateJsonSchema):
-    """pydantic's schema, extended by quantities and expressions; unknown types accept everything."""
+    """Pydantic's schema, extended by quantities and expressions. Unknown types accept everything."""
 
     expressions = False
     """Whether a number may also be an expression."""
 
     def function_before_schema(self, schema: core_schema.BeforeValidatorFunctionSchema) -> JsonSchema:
-        """Quantities are numbers or text; a value that may be left empty may be null."""
+        """A number or text for quantities, and null for values that may be left empty."""
         function: object = schema["function"]["function"]
         if isinstance(function, Quantity):
             return quantity_schema(function.dimension, expressions=self.expressions)
@@ -99,19 +99,19 @@ class _Generator(GenerateJsonSchema):
         return self._or_expression(super().float_schema(schema))
 
     def literal_schema(self, schema: core_schema.LiteralSchema) -> JsonSchema:
-        """One of the values; an expression may stand for numbers."""
+        """One of the values, or an expression if they are numbers."""
         literal = super().literal_schema(schema)
         is_number = self.expressions and "enum" in literal and literal.get("type") in ("number", "integer")
         text = {"type": "string", "pattern": _EXPRESSION}
         return {"anyOf": [literal, text]} if is_number else literal
 
     def function_plain_schema(self, schema: core_schema.PlainValidatorFunctionSchema) -> JsonSchema:
-        """Everything: a validator does not say what it accepts."""
+        """Any value, because a validator does not say what it accepts."""
         del schema
         return {}
 
     def handle_invalid_for_json_schema(self, schema: Any, error_info: str) -> JsonSchema:
-        """Everything: JSON schema cannot express the type."""
+        """Any value, because JSON schema cannot express the type."""
         del schema, error_info
         return {}
 
@@ -131,7 +131,7 @@ class _ExpressionGenerator(_Generator):
 
 
 def quantity_schema(dimension: str, *, expressions: bool = False) -> JsonSchema:
-    """Text with one of the units; a number that needs none.
+    """Text with one of the units, or a number that needs no unit.
 
     Example:
         >>> quantity_schema("time")["type"]
@@ -177,7 +177,7 @@ def model_schema(
     """The schema of a mapping of settings.
 
     Args:
-        prefix: Put before the names of its definitions, so that those of two models do not clash.
+        prefix: Prefix of the names of its definitions, so that definitions of two models do not clash.
     """
     if model is None:
         return {"type": "object", "properties": {}, "additionalProperties": False}
@@ -221,7 +221,7 @@ def _tidy(schema: Any) -> Any:
 
 
 def _limit_numbers(tidy: JsonSchema, dimension: str) -> None:
-    """Let a quantity be positive text if its limits say so, and a number only where that needs no unit."""
+    """Allow only positive text if a quantity's limits say so, and a number only if it needs no unit."""
     if tidy.get("minimum", tidy.get("exclusiveMinimum", -1)) >= 0:
         tidy["pattern"] = tidy["pattern"].replace(_SIGN, r"\+?", 1)
     if dimension == "fraction":
@@ -264,7 +264,7 @@ class _FileSchema:
         self._fill(keys, "target", self._choice("pattern", PatternChoice))
         self._fill(keys, "planner", or_empty(self._choice("planner", Choice)))
         self._fill(keys, "analysis", or_empty(analyses))
-        listed: JsonSchema = keys["measure"]["anyOf"][0]  # an item may be the name alone
+        listed: JsonSchema = keys["measure"]["anyOf"][0]  # an item may be just the name
         item: JsonSchema = {"anyOf": [listed["items"], {"type": "string"}]}
         self._fill(keys, "measure", or_empty({"anyOf": [{**listed, "items": item}, *item["anyOf"]]}))
         self._fill(keys, "shot", {"type": "array", "minItems": 1, "items": self._step()})
@@ -309,7 +309,7 @@ class _FileSchema:
         Args:
             kind: Kind of plugin.
             core: The core's keys next to them.
-            group: First part of the names of their definitions; by default the kind.
+            group: First part of the names of their definitions, by default the kind.
         """
         group = group or kind
         entries = [entry for entry in self._registry.entries() if entry.kind == kind]
@@ -348,7 +348,7 @@ class _FileSchema:
             kinds[entry.name] = {**about, **({"allOf": [settings]} if is_needed else or_empty(settings))}
         name = {"type": "string", "minLength": 1, "description": "name of the step, for addresses"}
         policy = model_schema(StepPolicy, "step.", self._definitions)
-        failing = "what follows its failures and exceeded budgets, instead of the run's policy"
+        failing = "reactions to its failures and exceeded budgets, instead of the run's policy"
         return {
             "type": "object",
             "properties": {**kinds, "name": name, "policy": {"description": failing, **or_empty(policy)}},
@@ -357,7 +357,7 @@ class _FileSchema:
         }
 
     def _scan(self) -> JsonSchema:
-        """Values of addresses, or a scanner with its settings and ranges; without expressions."""
+        """Values of addresses, or a scanner with its settings and ranges. Neither has expressions."""
         scanner = self._choice(_SCANNER, AdaptiveChoice)
         aims = [
             {"required": [aim], "properties": {aim: {"type": "string"}}} for aim in ("maximise", "minimise")
@@ -372,7 +372,7 @@ def _about(entry: Entry) -> str:
 
 
 def _grid_scan() -> JsonSchema:
-    """Addresses and the values that each takes, or a list of such mappings."""
+    """Addresses with the values of each, or a list of such mappings."""
     three = {"type": "array", "minItems": 3, "maxItems": 3}
     forms: list[JsonSchema] = [{"type": "array", "minItems": 1}]
     for form in FORMS:

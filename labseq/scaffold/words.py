@@ -1,4 +1,4 @@
-"""Types, limits and defaults of settings as one writes them in YAML; docstrings as Markdown."""
+"""Types, limits and defaults of settings as written in YAML, and docstrings as Markdown."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ _NOUNS: Final[dict[Any, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """What a value may be.
+    """The allowed values of a setting.
 
     Attributes:
-        noun: "whole number", "list of times".
-        limits: "at least 1", or "".
+        noun: Type such as "whole number" or "list of times".
+        limits: Limits such as "at least 1", or "".
     """
 
     noun: str
@@ -48,7 +48,7 @@ class Words:
 
 
 def value_of(setting: Setting) -> str:
-    """What may be written for a setting: its type, an example where no default shows one, its limits."""
+    """The allowed values of a setting: its type, an example if no default shows one, and its limits."""
     words = _words(setting.annotation, ())
     if setting.dimension and setting.is_required:
         words = Words(f"{words.noun} such as `{EXAMPLES[setting.dimension]}`", words.limits)
@@ -56,7 +56,7 @@ def value_of(setting: Setting) -> str:
 
 
 def default_of(setting: Setting) -> str:
-    """The default as it would be written in a file; "required", or "none"."""
+    """The default as it would be written in a file, or "required", or "none"."""
     if setting.is_required:
         return "required"
     return "none" if setting.default is None else f"`{_written(setting.default, setting.dimension)}`"
@@ -117,7 +117,7 @@ def _plural(noun: str) -> str:
 
 
 def _limits(metadata: Sequence[Any], dimension: str) -> str:
-    """Only the tightest of several limits counts."""
+    """The tightest lower and upper limit in words."""
     low = max(
         [(i.ge, False) for i in metadata if isinstance(i, Ge)]
         + [(i.gt, True) for i in metadata if isinstance(i, Gt)],
@@ -155,7 +155,7 @@ def _lengths(metadata: Sequence[Any], annotation: Any) -> str:
 
 
 def _written(value: Any, dimension: str) -> str:
-    """A value as YAML; a quantity with its unit."""
+    """A value as YAML, a quantity with its unit."""
     if value is PydanticUndefined or value is None:
         return ""
     if isinstance(value, bool):
@@ -170,7 +170,7 @@ def _written(value: Any, dimension: str) -> str:
 
 
 def _text(value: str) -> str:
-    """In quotes where YAML would read something else without them."""
+    """Text as YAML, in quotes if YAML would otherwise read something else."""
     try:
         read = compose(f"[{value}]", "")
     except ConfigError:
@@ -179,7 +179,7 @@ def _text(value: str) -> str:
 
 
 def _quantity(value: float, dimension: str) -> str:
-    """With as many digits as it needs to be read back the same."""
+    """A quantity as YAML, with enough digits to be read back unchanged."""
     texts = (format_quantity(value, dimension, digits) for digits in range(3, 16))
     return next((t for t in texts if math.isclose(parse_quantity(t, dimension), value)), str(value))
 
@@ -188,15 +188,15 @@ _ITEM: Final = re.compile(r"^(\*{0,2}\w+): ", re.MULTILINE)
 
 
 def summary(*documented: object) -> str:
-    """The first paragraph of the first docstring that there is, on one line."""
-    # Any other object has the docstring of its class, which says nothing about the object.
+    """The first paragraph of the first available docstring, on one line."""
+    # Other objects have the docstring of their class, which says nothing about the object.
     objects = (item for item in documented if inspect.isroutine(item) or isinstance(item, type))
     texts = (" ".join(_sections(item)[""].partition("\n\n")[0].split()) for item in objects)
     return next(filter(None, texts), "")
 
 
 def docstring(documented: object) -> str:
-    """A docstring as Markdown, without its examples: its text, then a list for each section."""
+    """A docstring as Markdown without its examples, with a list for each section."""
     texts: list[str] = []
     for title, text in _sections(documented).items():
         if not title:
@@ -208,7 +208,7 @@ def docstring(documented: object) -> str:
 
 
 def _sections(documented: object) -> dict[str, str]:
-    """The text of a Google-style docstring by section; the text before them is ""."""
+    """The text of a Google-style docstring by section. The key of the text before them is ""."""
     text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", inspect.getdoc(documented) or "").replace("``", "`")
     before, *sections = re.split(r"^(Args|Attributes|Example|Raises|Returns):$", text, flags=re.MULTILINE)
     bodies = [textwrap.dedent(body.strip("\n")) for body in sections[1::2]]

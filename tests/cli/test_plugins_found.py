@@ -71,7 +71,7 @@ def test_a_plugin_in_the_folder_is_advised_and_the_option_loads_it(
     add = "add 'plugin_folders: [../plugins]' to s.yaml, or " if "sequences/s.yaml" in command else ""
     mine = Path("plugins", "mine.py")
     assert "unknown planner 'lazy'; expected one of" in err
-    assert f"; {mine} offers it and is not loaded: {add}use --plugins plugins" in err
+    assert f"; {mine} offers it but is not loaded ({add}use --plugins plugins" in err
     assert not Path("code_ran").exists()
     _, _, err = call(*command, "--plugins", "plugins")
     assert Path("code_ran").exists()

@@ -212,7 +212,7 @@ def test_a_simulated_leader_loads_and_sends_go_on_the_clock_of_the_session() -> 
     assert device.wait_for("go", 10.0) == "2"
     clock.sleep(3.0)
     assert device.report("ready", {"shot": 1}) == "late"
-    with pytest.raises(DeviceTimeoutError, match="the simulated leader says 'go' after 400 ms"):
+    with pytest.raises(DeviceTimeoutError, match="the simulated leader sends 'go' after 400 ms"):
         device.wait_for("go", 0.1)
 
 

@@ -61,9 +61,9 @@ def test_a_name_can_be_had_again_by_another_kind(tmp_path: Path) -> None:
 def test_what_exists_is_never_written_over(tmp_path: Path) -> None:
     (tmp_path / "plugins" / "spiral").mkdir(parents=True)
     (tmp_path / "first.yaml").write_text("mine")
-    with pytest.raises(ConfigError, match="spiral: it exists already; choose another name"):
+    with pytest.raises(ConfigError, match="spiral: this already exists; choose another name"):
         make_plugin("planner", "spiral", tmp_path)
-    with pytest.raises(ConfigError, match=r"first\.yaml: it exists already"):
+    with pytest.raises(ConfigError, match=r"first\.yaml: this already exists"):
         make_file("sequence", "first", tmp_path)
     assert (tmp_path / "first.yaml").read_text() == "mine"
     assert [*(tmp_path / "plugins").iterdir()] == [tmp_path / "plugins" / "spiral"]
@@ -117,7 +117,7 @@ def test_a_disk_that_is_full_leaves_nothing_behind(tmp_path: Path, monkeypatch: 
         raise OSError(28, "No space left on device", str(path))
 
     monkeypatch.setattr(Path, "write_text", fail)
-    with pytest.raises(ConfigError, match="spiral: it cannot be made: No space left on device"):
+    with pytest.raises(ConfigError, match="spiral: this cannot be made \(No space left on device"):
         make_plugin("planner", "spiral", tmp_path)
     assert not list(tmp_path.rglob("*spiral*"))
 

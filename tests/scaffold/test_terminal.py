@@ -124,9 +124,9 @@ def test_nothing_of_that_name_to_explain(here: Path, capsys: pytest.CaptureFixtu
     (here / "plugins").mkdir()
     (here / "plugins" / "broken.py").write_text("LABSEQ_API = 1\n1 / 0\n")
     assert code_of("explain", "stpe", "image") == 2
-    not_included = f"{Path('plugins') / 'broken.py'} is not included: use --plugins plugins\n"
+    not_included = f"{Path('plugins') / 'broken.py'} is not included; use --plugins plugins\n"
     assert capsys.readouterr().err.startswith(not_included)
     assert code_of("explain", "stpe", "image", "--plugins", "plugins") == 2
     err = capsys.readouterr().err
     assert err.startswith("broken did not load: ZeroDivisionError: division by zero")
-    assert "there is nothing called 'stpe image' to explain; did you mean 'step image'?" in err
+    assert "there is no topic 'stpe image' to explain; did you mean 'step image'?" in err

@@ -330,7 +330,7 @@ def test_a_run_warns_of_what_its_own_plugins_print() -> None:
     seen = RecordingObserver()
     labseq.Session.open("s.yaml", observer=seen, output=Path("data")).run()
     (text,) = [values["text"] for name, values in seen.events if name == "warning"]
-    assert "while it was loaded it printed ('used'); this went to stderr" in text
+    assert "while it was loaded it printed 'used' to stderr" in text
     (log,) = Path("data").glob("*/*/events.jsonl")
     assert "it printed ('used')" in log.read_text("utf-8")
     assert "unused" not in log.read_text("utf-8")
