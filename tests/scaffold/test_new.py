@@ -117,7 +117,7 @@ def test_a_disk_that_is_full_leaves_nothing_behind(tmp_path: Path, monkeypatch: 
         raise OSError(28, "No space left on device", str(path))
 
     monkeypatch.setattr(Path, "write_text", fail)
-    with pytest.raises(ConfigError, match="spiral: this cannot be made \(No space left on device"):
+    with pytest.raises(ConfigError, match=r"spiral: this cannot be made \(No space left on device"):
         make_plugin("planner", "spiral", tmp_path)
     assert not list(tmp_path.rglob("*spiral*"))
 

@@ -91,7 +91,7 @@ def test_some_sites_are_measured(tmp_path: Path) -> None:
             "5:11: there are no sites '30,:' (of 20 x 20) to measure; expected target",
         ),
         ("measure: [loading@]", "5:11: 'loading@' names no sites after the '@' to measure"),
-        ("measure: [loading@left]", "5:11: 'left' names no sites to measure"),
+        ("measure: [loading@left]", "5:11: 'left' is not a set of sites to measure"),
         ("measure: []", "5:10: "),
         ("measure: loadin", "5:10: there is no quantity 'loadin' to measure"),
         ("measure: [loading, survival, loading]", "5:30: 'loading' is listed a second time"),
