@@ -280,7 +280,7 @@ def _check_indentation(document: Document, spec: StepSpec, entry: Entry) -> None
     for key in ("name", "policy"):
         if key not in settings and document.root.at((*spec.loc, key)) is not None:
             what = f"'{key}' is in the settings of '{spec.kind}'"
-            hint = f"write '{key}' on a line of its own below"
+            hint = f"write '{key}' on a separate line below"
             raise document.error((*spec.loc, key), what, f"'{key}' next to '{spec.kind}'", hint, key=True)
 
 

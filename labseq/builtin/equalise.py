@@ -236,7 +236,7 @@ def equalise_loop(
     spread, or of the expected spread after the round.
 
     Args:
-        measure: Measures the power of each spot once, float64 (n_rows, n_cols), nan where it cannot.
+        measure: Measures the power of each spot once, float64 (n_rows, n_cols), nan for unmeasured spots.
         apply: Plays such values.
         values: Initial amplitudes of rows (n_rows,) and of columns (n_cols,), or weights of the sites
             (n_rows, n_cols).

@@ -146,7 +146,7 @@ def compact(settings: CompactSettings, grid: SiteGrid) -> TargetPattern:
     """A full block of sites, for example the paper's 15 x 15 out of 20 x 20.
 
     Raises:
-        LimitError: It is larger than the grid or sticks out of it.
+        LimitError: The block is larger than the grid or sticks out of it.
     """
     check_size((settings.rows, settings.cols), grid.shape)
     mask = np.ones((settings.rows, settings.cols), np.bool_)
@@ -211,7 +211,7 @@ def bitmap(settings: BitmapSettings, grid: SiteGrid) -> TargetPattern:
     """Sites as they are drawn. The bounding box is the whole drawing, margins included.
 
     Raises:
-        LimitError: It is larger than the grid or sticks out of it.
+        LimitError: The drawing is larger than the grid or sticks out of it.
     """
     mask = settings.mask
     name = f"bitmap {mask.shape[0]} x {mask.shape[1]}"

@@ -57,7 +57,7 @@ class PulseOfBlock(Settings):
 
     @property
     def n_played(self) -> int:
-        """One."""
+        """Number of pulses, always 1."""
         return 1
 
     def played(self, place: str = "") -> Iterator[Played]:
@@ -99,7 +99,7 @@ class Block(Settings, Generic[P]):
             raise setting_error("a pulse has no duration", "'duration', or 'parts'")
         extra = next((key for key in ("duration", "lines") if key in self.model_fields_set), None)
         if self.parts and extra:
-            hint = "make it a part of its own"
+            hint = "make it a separate part"
             raise setting_error(f"'{extra}' is set with 'parts'", "one of them", hint, at=(extra,), key=True)
         if self.n_played > MAX_PULSES:
             what = f"there are {self.n_played} pulses, including repetitions"

@@ -47,7 +47,7 @@ DryRun = Annotated[
     DryRunKind | None,
     typer.Option(
         "--dry-run",
-        help="Use the calibrations of dry runs, which are separate from those of real devices.",
+        help="Use the calibrations of dry runs, which are separate from calibrations of real devices.",
         metavar="[=fast]",
         show_choices=False,
     ),

@@ -75,7 +75,7 @@ class Peak:
         return Peak(-self.mean, self.width, -self.skewness).below(-at)
 
     def widened(self, factor: float) -> Peak:
-        """The same peak with another width."""
+        """A copy of the peak with another width."""
         return Peak(self.mean, self.width * factor, self.skewness)
 
 

@@ -103,7 +103,7 @@ class Document:
         """Parse the content of a file, called ``name`` in messages.
 
         Raises:
-            ConfigError: It is not strict YAML 1.2 with a mapping at the top.
+            ConfigError: The content is not strict YAML 1.2 with a mapping at the top.
         """
         decoded = decode(text, name) if isinstance(text, bytes) else text.removeprefix("\ufeff")
         root = compose(decoded, name)

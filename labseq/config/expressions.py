@@ -75,7 +75,7 @@ class Quantity(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Its SI unit, or "" for a plain number."""
+        """The SI unit of the quantity, or "" for a plain number."""
         dimension = _DIMENSIONS.get(self.powers, "")
         if dimension == "number":
             return ""
@@ -86,7 +86,7 @@ class Quantity(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """Its dimension with an article: "a time", "an angle", "a number"."""
+        """The dimension with an article, such as "a time", "an angle" or "a number"."""
         dimension = _DIMENSIONS.get(self.powers) or f"quantity in {self.unit}"
         return f"{'an' if dimension[0] in 'aeio' else 'a'} {dimension}"
 
@@ -357,7 +357,7 @@ def evaluate(root: Node, text: str) -> tuple[Node, dict[Loc, str], dict[Loc, fro
         The file with computed values, the text of each expression, and the places on which each depends.
 
     Raises:
-        ConfigError: All errors in them.
+        ConfigError: All errors in the expressions.
     """
     evaluator = _Evaluator(root, re.split(r"\r\n|\r|\n", text))
     result = root

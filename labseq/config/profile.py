@@ -121,7 +121,7 @@ OFF: Final = "off"
 
 
 class CalibrationChoices(Settings):
-    """Which calibration of each kind to use instead of the active one."""
+    """The calibration of each kind to use instead of the active calibration."""
 
     sites: Text | None = Field(
         default=None, description="where the sites are on the frames: an id, or `off` for none"
@@ -137,7 +137,7 @@ class CalibrationChoices(Settings):
         default=None, description="tones of the mobile tweezers: an id, or `off`"
     )
     overlay: Text | None = Field(
-        default=None, description="position of the mobile tweezers on the static ones: an id, or `off`"
+        default=None, description="position of the mobile tweezers on the static tweezers: an id, or `off`"
     )
     timing: Text | None = Field(
         default=None, description="time from the start of a cycle to the light: an id, or `off`"
@@ -224,7 +224,7 @@ class MobileTweezersChoice(Choice):
 
     @property
     def motion(self) -> MotionSpec:
-        """How they move."""
+        """The motion of the mobile tweezers."""
         return MotionSpec(**{field.name: getattr(self, field.name) for field in fields(MotionSpec)})
 
 
@@ -387,7 +387,7 @@ class ProfileSpec(Settings):
 
     @property
     def motion(self) -> MotionSpec:
-        """How the mobile tweezers move."""
+        """The motion of the mobile tweezers."""
         return self.mobile_tweezers.motion
 
     @property

@@ -523,7 +523,7 @@ def leader_axis(address: str, mark: Mark, document: Document) -> Axis:
     """An address that another control system may set, as an axis without values.
 
     Raises:
-        ConfigError: It does not exist, or can only be set for a whole run.
+        ConfigError: The address does not exist, or can only be set for a whole run.
     """
     axis = _found(Axis(address, (), (), mark), document)
     loc, top = axis.loc, axis.loc[0]

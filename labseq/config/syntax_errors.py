@@ -74,7 +74,7 @@ def _stray_colon(text: str, at: YamlMark) -> Problem:
     if ": " not in before and line and spaces > above:
         what = f"this line is indented further than line {line}, which already has a value"
         return _at(at, what, f"{above} spaces as in line {line}")
-    hint = "put text that holds ': ' in quotes"
+    hint = "put text that contains ': ' in quotes"
     return _at(at, "a ':' is not allowed here", "one 'key: value' on a line", hint)
 
 

@@ -66,7 +66,7 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Node:
-    """One value of a YAML file. Immutable: copies share their common parts.
+    """One value of a YAML file. Nodes are immutable, so copies share their common parts.
 
     Attributes:
         value: A scalar, or the nodes of a list or mapping.
@@ -162,7 +162,7 @@ def compose(text: str, source: str, *, is_option: bool = False) -> Node | None:
         The top node, or None for an empty text.
 
     Raises:
-        ConfigError: All errors up to the one at which reading had to stop.
+        ConfigError: All errors until reading had to stop.
     """
     _check_characters(text, source, is_option)
     composer = _Composer(text, source, is_option)

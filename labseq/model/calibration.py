@@ -96,7 +96,7 @@ class CalibrationEntry:
         set_field(self, "id", _content_id(self))
 
     def is_for(self, grid: SiteGrid) -> bool:
-        """Whether it was made for a grid with these sites. The tones of rows and columns are ignored."""
+        """Whether the calibration is for a grid with these sites, whatever the tones of rows and columns."""
         return same_grid(self.grid, grid_facts(grid))
 
     def _check_shapes(self) -> None:
@@ -191,7 +191,7 @@ def _content_id(entry: CalibrationEntry) -> str:
 
 
 def correct_overlay(grid: SiteGrid, offset_m: ArrayLike) -> SiteGrid:
-    """The same grid, with tones shifted so that the mobile tweezers are on the sites.
+    """A grid with tones shifted so that the mobile tweezers are on the sites.
 
     An axis of one site takes the mean step of the other axis, and a grid of one site takes 1.6 MHz per
     spacing. The offsets of a probe use the same conversion.

@@ -80,7 +80,7 @@ class Rate:
         return jeffreys(self.n, self.n_trials)
 
     def as_json(self) -> dict[str, Any]:
-        """With the rate and its interval."""
+        """The numbers of events and trials, the rate and its interval."""
         return {"n": self.n, "n_trials": self.n_trials, "rate": self.value, "interval": self.interval}
 
 

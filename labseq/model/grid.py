@@ -156,7 +156,7 @@ def mean_step_hz(site_hz: Floats, other_hz: Floats) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetPattern:
-    """Which sites must hold an atom and which must be empty.
+    """The sites that must hold an atom, and the sites that must be empty.
 
     Attributes:
         fill: bool (n_rows, n_cols), sites that must hold an atom.
@@ -190,7 +190,7 @@ class TargetPattern:
 
     @property
     def is_none(self) -> bool:
-        """Whether it requires nothing of any site."""
+        """Whether the target requires nothing of any site."""
         return not (self.fill.any() or self.clear.any())
 
     @property

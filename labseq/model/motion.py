@@ -147,7 +147,7 @@ class LossSpec:
         ),
     ] = 0.5
     # The paper's, 0.45 %.
-    image: Annotated[Loss, Field(description="loss of an atom by one image, beyond that of the moves")] = (
+    image: Annotated[Loss, Field(description="loss of an atom by one image, in addition to the moves")] = (
         0.0045
     )
     # The paper's.

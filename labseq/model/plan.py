@@ -232,7 +232,7 @@ class Plan:
         return tuple(self.batch(i) for i in range(self.n_batches))
 
     def batch(self, index: int) -> Batch:
-        """One batch, as a view of the flat arrays."""
+        """The batch with an index, as a view of the flat arrays."""
         start, stop = self.batch_offsets[index : index + 2]
         moves = self.moves[start:stop]
         return Batch(moves[:, :2], moves[:, 2:], bool(self.linked[index]), self.paths(index))

@@ -95,7 +95,7 @@ class StepPolicy:
 
     @property
     def limit_s(self) -> float:
-        """Longest duration of an attempt, on the session's clock, in seconds; infinite without a timeout."""
+        """Longest duration of an attempt, on the session's clock, in seconds. Infinite without a timeout."""
         return math.inf if self.timeout_s is None else self.timeout_s
 
 

@@ -85,7 +85,7 @@ class StageTiming:
 
     @property
     def over_budget(self) -> bool:
-        """Whether it took longer than its budget.
+        """Whether the stage took longer than its budget.
 
         A millisecond more is allowed. On a real clock each wait ends a little late, so a load or a fixed
         window would otherwise always count as exceeded.
@@ -236,7 +236,7 @@ class ShotRecord:
         cycles: In the order they were made.
         timing: In the order the stages ended.
         steps: Planned and achieved durations of the steps that have ended.
-        edges: In the order they were played; within a program, line by line.
+        edges: In the order they were played. Within a program, line by line.
         seen_defect_free_cycle: Index of the first cycle whose image met the target. -1 if none.
         success: Whether the last ``image`` step met the target.
         filling_fraction: Filling of the target on the last ``image`` step. nan without such a step, or if a

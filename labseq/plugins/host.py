@@ -208,12 +208,12 @@ class UsedPlugin(NamedTuple):
 
     @property
     def is_built_in(self) -> bool:
-        """Whether it is a part of labseq itself."""
+        """Whether the plugin is a part of labseq itself."""
         return self.origin == _BUILT_IN
 
     @property
     def is_from_folder(self) -> bool:
-        """Whether it comes from a folder, so that loading it again imports it again."""
+        """Whether the plugin comes from a folder, so that loading it again imports it again."""
         return self.origin not in (_BUILT_IN, _INSTALLED)
 
 

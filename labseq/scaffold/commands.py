@@ -125,7 +125,7 @@ def explain(
 ) -> None:
     """Explain a key of a file, a step, a plugin, a command, a quantity, an error or a unit.
 
-    The text is that of the reference pages, with the installed plugins and those of --plugins.
+    The text is as in the reference pages, including the installed plugins and those of --plugins.
     """
     from labseq.scaffold.reference import explain_topic
 

@@ -60,7 +60,7 @@ name: compact-225 => name: 'compact'-225
 - image:⏎ => - image: {a: 'b}⏎
   27:16: the quotation mark that opens here is never closed
 name: compact-225 => name: compact: 225
-  3:14: a ':' is not allowed here; expected one 'key: value' on a line; put text that holds ': ' in quotes
+  3:14: a ':' is not allowed here; expected one 'key: value' on a line; put text that contains ': ' in quotes
 name: compact-225 => name: "C:\\data"
   3:10: in double quotes a backslash begins an escape, and '\\d' is not a complete one; put a path into single quotes, or write '/' or two backslashes for each backslash
 name: compact-225 => name: "C:\\Users\\lab"
