@@ -318,7 +318,7 @@ def check_role(entry: Entry, instance: object) -> None:
     called, see = f"{entry.kind} '{entry.name}'", f"see labseq.plugin.{base.__name__}"
     if instance is None or isinstance(instance, type):
         raise entry.owner.fault(
-            f"the factory of {called} made {_called(instance)}; expected an object; {see}"
+            f"the factory of {called} made {_called(instance)} instead of an object; {see}"
         )
     if issubclass(base, ABC):
         if not isinstance(instance, base):

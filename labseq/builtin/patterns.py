@@ -138,7 +138,7 @@ class CompactSettings(Settings):
     rows: int = Field(ge=1, description="rows of the block")
     cols: int = Field(ge=1, description="columns of the block")
     origin: tuple[Index, Index] | None = Field(
-        default=None, description="[row, column] of its top left site, from 0; centred if left out"
+        default=None, description="[row, column] of its top left site, from 0. By default it is centred"
     )
 
 
@@ -175,7 +175,7 @@ class BitmapSettings(Settings):
         description="characters of a text that mean an atom. All others are empty sites",
     )
     origin: tuple[Index, Index] | None = Field(
-        default=None, description="[row, column] of its top left site, from 0; centred if left out"
+        default=None, description="[row, column] of its top left site, from 0. By default it is centred"
     )
     clear: Literal["bounding_box", "none"] = Field(
         default="bounding_box",

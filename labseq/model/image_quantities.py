@@ -199,7 +199,7 @@ class ImageQuantity:
 
 OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
     "survival": ImageQuantity(
-        "share of the atoms in one image that a later image shows, at the sites to which they were moved; "
+        "share of the atoms in one image that a later image shows, at the sites to which they were moved, "
         "by default from the first image to the last",
         n_images=2,
         is_rate=True,
@@ -208,7 +208,7 @@ OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
         sum_up=lambda n, n_tried: (n, n_tried),
     ),
     "filling": ImageQuantity(
-        "share of the target's sites with an atom; last image",
+        "share of the target's sites with an atom, by default on the last image",
         n_images=1,
         is_rate=False,
         needs_target=True,
@@ -216,7 +216,7 @@ OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
         sum_up=lambda n, n_tried: (1 - (n_tried - n) / n_tried, 1),
     ),
     "defect_free": ImageQuantity(
-        "whether the target is met; last image",
+        "whether the target is met, by default on the last image",
         n_images=1,
         is_rate=True,
         needs_target=True,
@@ -224,7 +224,7 @@ OF_IMAGES: Final[Mapping[str, ImageQuantity]] = {
         sum_up=lambda n, n_tried: (float(n == n_tried), 1),
     ),
     "loading": ImageQuantity(
-        "share of all sites with an atom; first image",
+        "share of all sites with an atom, by default on the first image",
         n_images=1,
         is_rate=False,
         needs_target=False,
