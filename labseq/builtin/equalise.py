@@ -1,9 +1,9 @@
 """The step that equalises the static tweezers in a closed loop.
 
-The power of the spot (i, j) depends on the tone of row i and the tone of column j: ``P_ij = P f_i g_j (1 +
-e_ij)``. The factors f and g are the *separable* part, which the tones can make even. The residual e cannot be
-changed by tones. Light shifts may be used instead of powers. Tweezers with a weight for each site, as from an
-SLM, have no such residual.
+The power of the spot (i, j) depends on the tone of row i and the tone of column j:
+``P_ij = P f_i g_j (1 + e_ij)``. The factors f and g are the *separable* part, which the tones can make even.
+The residual e cannot be changed by tones. Light shifts may be used instead of powers. Tweezers with a weight
+for each site, as from an SLM, have no such residual.
 """
 
 from __future__ import annotations

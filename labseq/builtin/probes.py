@@ -81,7 +81,7 @@ class ProbeStep(Step):
         return [TimelineEntry("probe", duration_s, min_duration_s, timed_by=TimedBy("mobile_tweezers"))]
 
     def run(self, shot: Shot) -> None:
-        """Hold the atoms on the last image, or probe all sites."""
+        """Hold the atoms seen on the last image, or the atoms of all sites."""
         occupancy = shot.occupancy
         if occupancy is None:
             raise ConfigError("probe needs an image before it in the shot")

@@ -306,7 +306,7 @@ class AlarmSettings(Settings):
     loading: Fraction = Field(
         default=0.5,
         description="least number of loaded atoms, relative to the mean of the last 10 to 20 shots with the "
-        "same settings. The alarm also needs 5 standard deviations. 0 turns the alarm off",
+        "same settings. It must also be 5 standard deviations below. 0 turns the alarm off",
     )
     confidence: Fraction = Field(
         default=0.99,

@@ -240,7 +240,7 @@ class RangeAxis(Axis):
         return self.low.unit
 
     def at(self, value: float) -> Axis:
-        """The axis at one value, SI, as a user would write it, rounded to a few digits without steps."""
+        """The axis at one value, SI, as a user would write it, rounded if there are no steps."""
         if not isinstance(value, int) and not self.n_steps:
             low, high = self.low.amount, self.high.amount
             # A ten-thousandth of the range is finer than any setting needs.

@@ -332,8 +332,8 @@ def load_sequence(
         profile_set: Overrides of the profile, with their "profile.". They replace a scan of their address.
 
     Returns:
-        The document with overrides, the default planner and the first point of its scan. The content of the
-        document, with fallbacks for wrong values. The scan. Its axes in the profile have no locations yet.
+        The document with overrides, the default planner and the first point of its scan, its content with
+        fallbacks for wrong values, and its scan, whose axes in the profile have no locations yet.
 
     Raises:
         ConfigError: All errors, except in settings of plugins.

@@ -127,7 +127,7 @@ class FrequencyComb(Settings):
     def _tones_in_order(cls, table: tuple[float, ...]) -> tuple[float, ...]:
         steps_hz = np.diff(table)
         if not (np.all(steps_hz > 0) or np.all(steps_hz < 0)):
-            raise ValueError("the tones neither rise nor fall throughout; expected the sites' in order")
+            raise ValueError("the tones neither rise nor fall throughout; expected the order of the sites")
         return table
 
     def tones(self, n_sites: int) -> NDArray[np.float64]:

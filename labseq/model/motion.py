@@ -164,7 +164,7 @@ Sites: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
 class MotionSpec:
     """Motion of the mobile tweezers for every driver: ramps, speed, overheads and limits.
 
-    Ramps and speed are the paper's ("Experimental Setup"). The overhead of a cycle is ours, because the
+    Ramps and speed are the paper's ("Experimental Setup"). The overhead of a cycle is our estimate. The
     paper's cycle time of x1.8 over ten cycles leaves about 13 ms per later cycle in addition to the exposure.
     An empty plan has no overhead.
     """

@@ -24,10 +24,10 @@ STAGES: Final[Mapping[str, str]] = {
 """Stages of a shot -> their meaning."""
 
 OUTCOMES: Final[Mapping[str, str]] = {
-    "defect-free": "the last image of the shot shows an atom on each site of the target, and none on sites "
+    "defect-free": "the shot's last step `image` shows an atom on each site of the target, and none on sites "
     "that must be empty",
     "seen defect-free": "an image after a rearrangement showed the target without a defect, although atoms "
-    "may be lost before the last image of the shot",
+    "may be lost before the shot's last step `image`",
     "defects": "empty sites of the target",
     "seen defects": "defects on a shot's last image, as the detector sees it",
     "true defects": "empty sites of the target at the end of a shot, which only a simulation knows",
