@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 bench = typer.Typer(
     name="bench",
     help="Measure and compare parts of labseq.",
-    short_help="Compare planners; measure rendering and latency.",
+    short_help="Compare planners, and measure rendering and latency.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -43,10 +43,10 @@ Examples:
 
 @contextmanager
 def progress_of(unit: str) -> Generator[Callable[[int, int], None]]:
-    """A progress bar on stderr if that is a terminal, else a line for every tenth.
+    """A progress bar on stderr if stderr is a terminal, else a line for every tenth of the work.
 
     Args:
-        unit: What is counted, in the plural.
+        unit: Name of the counted things, in the plural.
     """
     from labseq.console.output import say
 
@@ -81,7 +81,7 @@ def planners(
     ] = "psca",
     grid: Annotated[str, typer.Option(metavar="ROWSxCOLS", help="Sites of the grid.")] = "20x20",
     target: Annotated[
-        str, typer.Option(metavar="PATTERN|SEQUENCE", help="The target, as for labseq plan.")
+        str, typer.Option(metavar="PATTERN|SEQUENCE", help="The target, as in labseq plan.")
     ] = "{pattern: compact, rows: 15, cols: 15}",
     loading: Annotated[str, typer.Option(metavar="P", help="Probability that a site is loaded.")] = "75 %",
     dop: Annotated[
@@ -97,15 +97,15 @@ def planners(
     ] = 1000,
     seed: Annotated[
         int,
-        typer.Option(metavar="N", min=0, help="Seed of all loadings; the same seed gives the same result."),
+        typer.Option(metavar="N", min=0, help="Seed of all loadings. The same seed gives the same result."),
     ] = 1,
     overrides: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="ADDRESS=VALUE",
-            help="planner.KEY=VALUE changes every planner, profile.mobile_tweezers.KEY=VALUE the motion "
-            "of the tweezers; may be given several times.",
+            help="planner.KEY=VALUE changes every planner, and profile.mobile_tweezers.KEY=VALUE the motion "
+            "of the tweezers. May be given several times.",
         ),
     ] = None,
     workers: Annotated[
@@ -124,7 +124,7 @@ def planners(
     ] = None,
     _plugins: Plugins = None,
 ) -> None:
-    """Let planners plan the same random loadings, check every plan, and compare the results."""
+    """Let planners plan for the same random loadings, check every plan, and compare the results."""
     from labseq.bench.comparison import read_comparison
     from labseq.bench.planners import Resources, compare
     from labseq.cluster import check_workers
@@ -150,7 +150,7 @@ def planners(
 
 
 def _write_files(report: Report, csv: Path | None, png: Path | None, json: str | None) -> None:
-    """Write table and picture, and name all files."""
+    """Write table and picture, and print the names of all files."""
     from labseq.bench.report import save_histogram
     from labseq.console.output import STDOUT, say, write_text
 
@@ -163,7 +163,7 @@ def _write_files(report: Report, csv: Path | None, png: Path | None, json: str |
 
 
 def _raise_failures(report: Report) -> None:
-    """Raise what ended the comparison, or a ``PlanError`` if plans are wrong."""
+    """Raise the error that ended the comparison, or a ``PlanError`` if plans are wrong."""
     from labseq.errors import PlanError
 
     if report.ended_by is not None:
@@ -171,7 +171,7 @@ def _raise_failures(report: Report) -> None:
     if failed := [row for row in report.rows if row["n_failed"]]:
         n, n_plans = sum(row["n_failed"] for row in failed), sum(row["n_loadings"] for row in failed)
         names = ", ".join(dict.fromkeys(f"'{row['planner']}'" for row in failed))
-        raise PlanError(f"{n} of {n_plans} plans of {names} are wrong; they are not counted in the table")
+        raise PlanError(f"{n} of {n_plans} plans of {names} are wrong, and not counted in the table")
 
 
 @bench.command(epilog=LATENCY_EXAMPLES, short_help="Measure the time from a frame to the first light.")
@@ -180,7 +180,7 @@ def latency(
         Path,
         typer.Argument(
             metavar="SEQUENCE",
-            help="The sequence; its target, its planner and its first image are used.",
+            help="The sequence whose target, planner and first image are used.",
             show_default=False,
         ),
     ],
@@ -190,7 +190,7 @@ def latency(
             "--profile",
             "-p",
             metavar="NAME|FILE",
-            help="Hardware profile, instead of the one that the sequence names.",
+            help="Hardware profile, instead of the sequence's own.",
             autocompletion=profile_names,
         ),
     ] = None,
@@ -198,7 +198,7 @@ def latency(
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of all loadings.")] = 1,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="ADDRESS=VALUE", help="As for labseq run; may be given several times."),
+        typer.Option("--set", metavar="ADDRESS=VALUE", help="As in labseq run. May be given several times."),
     ] = None,
     json: JsonFile = None,
     picture: Annotated[
@@ -209,7 +209,7 @@ def latency(
 ) -> None:
     """Measure the time from a frame in memory to the first light of the mobile tweezers.
 
-    Shots are taken in a dry run up to the first image; then the atoms are rearranged once, as in a run.
+    Shots are taken in a dry run up to the first image. Then the atoms are rearranged once, as in a run.
     """
     from labseq.bench.latency import LatencyRequest, draw_report, measure_latency
     from labseq.console.output import json_writer, report_compiling, say
@@ -233,11 +233,11 @@ def latency(
 @bench.command(short_help="Measure the speed of rendering.")
 def waveform(
     repeats: Annotated[
-        int, typer.Option(metavar="N", min=1, help="Number of repetitions; the fastest one counts.")
+        int, typer.Option(metavar="N", min=1, help="Number of repetitions. The fastest one counts.")
     ] = 15,
     json: JsonFile = None,
 ) -> None:
-    """Measure rendering on this computer: by kind of segment, and for a plan."""
+    """Measure rendering on this computer, for each kind of segment and for a plan."""
     from labseq.bench.rendering import bench_waveform
     from labseq.console.output import json_writer, report_compiling, say
 

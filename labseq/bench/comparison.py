@@ -26,14 +26,14 @@ _KEY_AND_EQUALS: Final = r"[^\W\d]\w*\s*="
 
 @dataclass(frozen=True, slots=True)
 class PlannerEntry:
-    """A planner in a comparison; settings that are not given have their defaults."""
+    """A planner in a comparison. Settings that are not given have their defaults."""
 
     planner: str
     settings: SettingTexts = ()
 
     @property
     def label(self) -> str:
-        """Its name in tables.
+        """Name of the planner in tables.
 
         Example:
             >>> PlannerEntry("psca", (("variant", "paper"),)).label
@@ -50,7 +50,7 @@ class Condition:
         shape: Rows and columns of the grid.
         target: A pattern or a sequence, as after ``--target``.
         loading: Probability that a site is loaded.
-        degree_of_parallelism: For every planner with such a setting; None for the planner's default.
+        degree_of_parallelism: Value for every planner with such a setting. None for the planner's default.
         motion: Settings of the motion that differ from the defaults, as typed.
     """
 
@@ -71,7 +71,7 @@ class Comparison:
         n_loadings: Number of loadings of each condition.
         seed: Seed of all loadings.
         settings: Settings from ``--set`` for every planner, as typed.
-        called: How messages name the planners: an option or a figure.
+        called: How messages name the planners, by an option or a figure.
     """
 
     planner_entries: tuple[PlannerEntry, ...]
@@ -101,7 +101,7 @@ def parse_planners(text: str) -> tuple[PlannerEntry, ...]:
         if not re.fullmatch(_NAME, name.strip()) or not all(
             key.strip() and value for key, _, value in settings
         ):
-            expected = "names with commas between them, each perhaps with settings: psca,psca:variant=paper"
+            expected = "names with commas between them, if need be with settings: psca,psca:variant=paper"
             raise ConfigError(Problem("this is not a list of planners", option, expected=expected))
         texts = tuple((key.strip(), value.strip()) for key, _, value in settings)
         planner_entry = PlannerEntry(name.strip(), texts)
@@ -146,7 +146,7 @@ def parse_loading(text: str) -> float:
 
 
 def parse_parallelism(text: str | None) -> tuple[int | None, ...]:
-    """Read degrees of parallelism; (None,) for that of each planner.
+    """Read degrees of parallelism. (None,) keeps each planner's own value.
 
     Example:
         >>> parse_parallelism("7,15"), parse_parallelism(None)
@@ -164,7 +164,7 @@ def parse_parallelism(text: str | None) -> tuple[int | None, ...]:
 
 
 def parse_overrides(texts: Sequence[str]) -> tuple[SettingTexts, SettingTexts]:
-    """Separate the settings of planners from those of the motion in the values of ``--set``.
+    """Separate the settings of planners from settings of the motion in the values of ``--set``.
 
     Returns:
         Settings of the planners, and settings of ``profile.mobile_tweezers``.
@@ -203,7 +203,7 @@ def read_comparison(
     seed: int = 1,
     overrides: Sequence[str] = (),
 ) -> Comparison:
-    """Read the options of ``labseq bench planners``; raises ``ConfigError`` if one has an error."""
+    """Read the options of ``labseq bench planners``. Raises ``ConfigError`` if one has an error."""
     settings, motion = parse_overrides(overrides)
     condition = parse_grid(grid), target, parse_loading(loading)
     conditions = tuple(Condition(*condition, n, (*BARE_MOTION, *motion)) for n in parse_parallelism(dop))

@@ -31,7 +31,7 @@ from labseq.units import format_quantity
 HOST_STAGES: Final = ("detect", "plan", "check", "tones", "prepare")
 """The stages between a frame in memory and the first samples at the device.
 
-``tones`` is a part of ``prepare`` in the record of a shot, and counts separately here."""
+In the record of a shot, ``tones`` is a part of ``prepare``. Here it counts separately."""
 
 BETWEEN: Final = "in between"
 """Stage of the remaining time, for the shot's record and between steps."""
@@ -39,7 +39,7 @@ BETWEEN: Final = "in between"
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Durations of a stage over all loadings.
+    """Statistics of a stage's duration over all loadings.
 
     Attributes:
         median_s: Median on this computer's clock.
@@ -78,15 +78,15 @@ class LatencyReport:
         n_batches: Median number of batches of a plan.
         playing_s: Median playing time of its tone program.
         stages: From the frame to the first samples at the device, in order.
-        total: From a frame in memory to the first samples; a whole program, if the device needs that.
+        total: From a frame in memory to the first samples, or to a whole program if the device needs that.
         start: Duration of ``play()``.
         light: From a frame in memory to the light.
-        light_s: The same of each loading, in seconds, with modelled times.
+        light_s: Time to the light for each loading, in seconds, with modelled times.
         device: Model of the mobile tweezers, from their description.
-        mode: Their mode, if they have one.
+        mode: Mode of the mobile tweezers, if they have one.
         readout_s: The camera's read-out time.
         delay_s: Time from ``play()`` to the output.
-        load: Mean number of busy processes in the last minute; None if unknown.
+        load: Mean number of busy processes in the last minute. None if unknown.
     """
 
     n_loadings: int
@@ -116,7 +116,7 @@ class LatencyReport:
         return float(median), float(p99), max(self.light_s)
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, in SI."""
+        """All attributes, in SI units."""
         return asdict(self) | {"light_quantiles_s": self.light_quantiles_s}
 
     def as_text(self) -> list[str]:
@@ -134,7 +134,7 @@ class LatencyRequest:
     """The sequence, profile and loadings of a measurement.
 
     Attributes:
-        sequence: The sequence file: its target, its planner, and how its first image is taken.
+        sequence: The sequence file, which gives the target, the planner and the first image.
         profile: Name or path of the profile, instead of the sequence's own.
         overrides: ``"address=value"`` strings, as given to ``--set``.
         n_loadings: Number of random loadings.
@@ -156,13 +156,13 @@ def measure_latency(
 ) -> LatencyReport:
     """Take shots in a dry run up to the first image, and time the following stages.
 
-    Frames, detector, planner and driver are those of a run, and are called as in a run. No program
+    Frames, detector, planner and driver are the same as in a run, and are called in the same way. No program
     is played to its end.
 
     Args:
         request: Sequence, profile and loadings.
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
-        progress: Called with the numbers of loadings that are done and wanted.
+        progress: Called with the numbers of finished and requested loadings.
 
     Raises:
         ConfigError: The request, the sequence or the profile has an error.
@@ -180,7 +180,7 @@ def measure_latency(
         observer=times,
     )
     lab = session.build_lab()
-    lab = replace(lab, motion=replace(lab.motion, overhead_per_cycle_s=0.0))  # models what is measured here
+    lab = replace(lab, motion=replace(lab.motion, overhead_per_cycle_s=0.0))  # the real overhead is measured
     rearrangement = _RearrangeOnce()
     steps: list[tuple[str, Any]] = [*_up_to_the_image(session), ("latency", rearrangement)]
     with stop_on_signals(session.stop_flag):
@@ -210,7 +210,7 @@ class _TimesRecorder:
         self.shots: list[dict[str, tuple[float, float]]] = []
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Announce that kernels are compiled."""
+        """Report that kernels are compiled."""
         if name == "compiling":
             self._announce(float(values["about_s"]))
 
@@ -231,7 +231,7 @@ class _RearrangeOnce(Step):
         self.plans: list[tuple[int, float]] = []
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002
-        """Empty: its duration is not planned."""
+        """Empty, because its duration is not planned."""
         return []
 
     def run(self, shot: Shot) -> None:
@@ -239,7 +239,7 @@ class _RearrangeOnce(Step):
         raise_priority()  # as a run in real time does before the frame
         plan, report = checked_plan(shot, 0)
         if plan.n_batches == 0:
-            problem = "there is nothing to move: a random loading needs no moves, or has no atoms to move"
+            problem = "there is nothing to move: a random loading needs no moves or has no atoms"
             raise ConfigError(Problem(problem, "shot", hint="choose another target or loading"))
         n_first = n_beginning(shot, plan, report, plan.n_batches)
         build = partial(tone_program, plan.first(n_first), shot.grid, shot.motion)
@@ -273,9 +273,9 @@ def _report(
 ) -> LatencyReport:
     shots = times_recorder.shots[N_WARM:]
     times = {name: np.array([shot[name] for shot in shots]).T for name in (*HOST_STAGES, "start", "light")}
-    times["prepare"][0] -= times["tones"][0]  # of which they are a part in the record
+    times["prepare"][0] -= times["tones"][0]  # in the record they include the tones
     light_s, modelled_s = times["light"]
-    # light ends with start: without it, the samples are at the device
+    # light ends with start, before which the samples are at the device
     total_s = light_s - times["start"][0]
     between_s = total_s - sum(times[name][0] for name in HOST_STAGES)
     stages = [Stage.of(name, *times[name]) for name in HOST_STAGES]
@@ -304,7 +304,7 @@ def _report(
 
 
 def draw_report(report: LatencyReport, path: Path) -> None:
-    """Draw a histogram of the times from a frame to the light; see :func:`draw_times`."""
+    """Draw a histogram of the times from a frame to the light, see :func:`draw_times`."""
     mode = f", mode {report.mode}" if report.mode else ""
     load = "" if report.load is None else f", load {report.load:.2g}"
     title = f"{report.device}{mode}: {plural(report.n_loadings, 'program')}{load}"
@@ -342,7 +342,7 @@ def draw_times(light_s: Sequence[float], title: str, path: Path) -> None:
 
 
 def _notes(report: LatencyReport) -> list[str]:
-    """Notes below the table: times, plans, profile and computer."""
+    """Notes below the table on times, plans, profile and computer."""
     device = f"{report.device}, mode {report.mode}" if report.mode else report.device
     load = "" if report.load is None else f", load {report.load:.2g}"
     playing, delay = format_quantity(report.playing_s, "time"), format_quantity(report.delay_s, "time")
@@ -350,9 +350,9 @@ def _notes(report: LatencyReport) -> list[str]:
     median, p99, worst = (format_quantity(s, "time") for s in report.light_quantiles_s)
     ended = format_quantity(report.light_quantiles_s[0] + report.readout_s, "time")
     return [
-        f"frame to light, with what is modelled: median {median}, 99 % {p99}, at most {worst}",
+        f"frame to light, with modelled times: median {median}, 99 % {p99}, at most {worst}",
         f"end of the exposure to light: {ended}, then {playing} of moves",
-        f"{plural(report.n_loadings, 'loading')}, seed {report.seed}; {plural(report.n_cores, 'core')}{load}",
+        f"{plural(report.n_loadings, 'loading')}, seed {report.seed}, {plural(report.n_cores, 'core')}{load}",
         f"{planner}: {report.n_batches:g} batches",
         f"profile {report.profile}: {device}; {delay} from play() to the output",
         "prepare and start include the work of a simulated device",

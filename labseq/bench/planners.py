@@ -24,8 +24,8 @@ from labseq.workers import POLL_S, QUEUED, ProcessWorkers, Workers
 
 @contextmanager
 def _signals(handler: Any, *numbers: int) -> Generator[None]:
-    """Handle signals in another way for a while; other threads than the main one get none."""
-    # Python sets handlers in the main thread only
+    """Handle signals with ``handler`` inside the block. Has no effect in threads other than the main one."""
+    # Python sets handlers only in the main thread
     is_main = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, handler) for number in numbers if is_main}
     try:
@@ -44,8 +44,8 @@ class Resources:
     """The processes in which planners plan.
 
     Attributes:
-        n_workers: Number of processes on this computer; None for one per core, if there is enough work.
-        scheduler: Address of the scheduler of a dask cluster that does it instead.
+        n_workers: Number of processes on this computer. None for one per core, if there is enough work.
+        scheduler: Address of the scheduler of a dask cluster that does the work instead.
         keys: Folder of the cluster's certificates.
     """
 
@@ -70,10 +70,10 @@ def compare(
         comparison: Planners, conditions and loadings.
         resources: The processes in which the planners plan.
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
-        progress: Called with the numbers of loadings that are done and wanted.
+        progress: Called with the numbers of finished and requested loadings.
 
     Raises:
-        ConfigError: The comparison has an error, or there is no such cluster; says what was expected.
+        ConfigError: The comparison has an error, or there is no such cluster.
         PluginLoadError: A named plugin failed to load.
     """
     start_s = time.perf_counter()
@@ -88,7 +88,7 @@ def compare(
     received: list[int] = []
 
     def interrupt(number: int, _frame: FrameType | None) -> None:
-        received.append(number)  # KeyboardInterrupt does not say which signal it was
+        received.append(number)  # KeyboardInterrupt does not carry the number
         raise KeyboardInterrupt
 
     try:
@@ -111,7 +111,7 @@ def compare(
 
 
 def _results(comparison: Comparison, resources: Resources, cluster: Workers | None) -> Generator[JobResults]:
-    """The results of all loadings, in any order; closed early, it ends its processes at once."""
+    """The results of all loadings, in any order. If closed early, it ends its processes at once."""
     n_workers = resources.n_workers or n_cores()
     jobs = _jobs(comparison, n_workers)
     if cluster is None and n_workers > 1 and resources.n_workers is None:
@@ -137,7 +137,7 @@ def _results(comparison: Comparison, resources: Resources, cluster: Workers | No
 
 
 def _begun(comparison: Comparison, jobs: list[Job]) -> Generator[JobResults, None, list[Job]]:
-    """Do jobs in this process until a second one is worth starting; returns the remaining jobs."""
+    """Do jobs in this process until a second process is worth starting. Returns the remaining jobs."""
     start_s, n_done = time.perf_counter(), 0
     for job_results in map(prepare(comparison), jobs):
         yield job_results

@@ -21,12 +21,12 @@ from labseq.units import format_quantity
 
 N_CHANNELS: Final = 2
 CHUNK: Final = 1 << 18
-"""Samples per chunk; all chunks are rendered into the same buffer, as by a streaming driver."""
+"""Samples per chunk. All chunks are rendered into the same buffer, as by a streaming driver."""
 
 Samples = NDArray[np.int16]
 
 SITES: Final = 5
-"""Distance of each transport, in sites, about the mean of a plan."""
+"""Distance of each transport, in sites. About the mean of a plan."""
 
 
 PLAN: Final = PlanRequest("random:20x20@75%", "{pattern: compact, rows: 15, cols: 15}", "psca", 7, seed=1)
@@ -39,7 +39,7 @@ class RenderedProgram:
 
     Attributes:
         gigasamples_per_s: Samples of both channels per second, in 1e9.
-        playing_over_rendering: Its playing time over the time of rendering it.
+        playing_over_rendering: Playing time divided by rendering time.
     """
 
     name: str
@@ -56,19 +56,19 @@ PROGRAMS: Final[Sequence[Column[RenderedProgram]]] = (
 
 @dataclass(frozen=True, slots=True)
 class RenderingReport:
-    """The speed of rendering: one row for each kind of segment, and one for a plan."""
+    """The speed of rendering, with one row for each kind of segment and one for a plan."""
 
     rows: Sequence[RenderedProgram]
     sample_rate_hz: float
     repeats: int
 
     def as_text(self) -> list[str]:
-        """A table of the measurements, and their extent."""
+        """A table of the measurements, and the number of repetitions."""
         rate = format_quantity(self.sample_rate_hz, "frequency")
         return [
             *table(self.rows, PROGRAMS),
             "",
-            f"{rate}, two threads; the best of {self.repeats}",
+            f"{rate}, two threads, the best of {self.repeats}",
             "above 1 the computer renders faster than the card plays",
         ]
 
@@ -76,7 +76,7 @@ class RenderingReport:
 def bench_waveform(
     repeats: int = 5, *, announce: Callable[[float], None] = lambda _: None
 ) -> RenderingReport:
-    """Measure rendering in two threads into reused buffers; the fastest of several repetitions counts.
+    """Measure rendering in two threads into reused buffers. The fastest of several repetitions counts.
 
     Args:
         repeats: Number of repetitions.
@@ -95,7 +95,7 @@ def bench_waveform(
 
 def _rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[RenderedProgram]:
     grid = moves.grid
-    # without pauses, during which there is nothing to render
+    # without pauses, which need no rendering
     motion = replace(moves.motion, overhead_per_batch_s=0.0)
     plan = tone_program(moves.plan, grid, motion)
     jerk = uniform_program(grid, 7, (1,), FrequencyCourse.MINIMUM_JERK)
@@ -108,7 +108,7 @@ def _rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[Render
         ("plan 20 -> 15 at 7, pauses left out", plan),
     ):
         renderer = Renderer(program, rate_hz)
-        # the fastest: other work on the computer only makes it slower
+        # the fastest, because other work on the computer only makes it slower
         taken_s = min(timeit.repeat(partial(render_all, renderer), number=1, repeat=repeats))
         yield RenderedProgram(
             name=name,
@@ -120,7 +120,7 @@ def _rows(moves: PlannedMoves, rate_hz: float, repeats: int) -> Generator[Render
 def uniform_program(
     grid: SiteGrid, n_tones: int, directions: tuple[int, ...], course: int = FrequencyCourse.LINEAR
 ) -> ToneProgram:
-    """A program of 100 transports: column tones that move in given directions, a fixed row tone.
+    """A program of 100 transports, with a fixed row tone and column tones that move in given directions.
 
     They move back and forth, so that the tones stay in the band.
     """

@@ -1,4 +1,4 @@
-"""The results of a comparison of planners: a row per condition and planner; text, CSV, JSON, histogram."""
+"""The results of a comparison of planners, per condition and planner, as text, CSV, JSON and histogram."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def ratio_of_means(numerator: ArrayLike, denominator: ArrayLike) -> Estimate:
-    """The ratio of two means of the same loadings, and its error to first order.
+    """The ratio of two means over the same loadings, and its error to first order.
 
     Example:
         >>> ratio_of_means([4.0, 6.0], [2.0, 3.0])
@@ -49,7 +49,7 @@ class Row:
     """Results of one planner under one condition.
 
     Attributes:
-        values: The values for export, see :func:`summarise`; also by ``row[name]``.
+        values: The values for export, see :func:`summarise`. Also available as ``row[name]``.
         first_failure: The first loading for which the planner failed or its plan broke a rule, or None.
         counts: int64 (n,), number of plans with 0, 1, 2, ... batches.
     """
@@ -102,8 +102,8 @@ class Report:
     """The results of a comparison.
 
     Attributes:
-        rows: A row per condition and planner; none for a condition without any loading done.
-        n_done: Loadings that were done, over all conditions.
+        rows: A row per condition and planner. None for a condition without any finished loading.
+        n_done: Number of finished loadings, over all conditions.
         duration_s: Duration of the comparison, in seconds.
         ended_by: The error that ended it early, or None.
     """
@@ -130,7 +130,7 @@ class Report:
         return f"{self.comparison.n_loadings} loadings{incomplete}, seed {self.comparison.seed}"
 
     def as_json(self) -> dict[str, Any]:
-        """Everything."""
+        """The rows and the extent."""
         return {
             "complete": self.ended_by is None,
             "seed": self.comparison.seed,
@@ -144,7 +144,7 @@ class Report:
         return [*_table(self), *notes(self)]
 
     def as_csv(self) -> str:
-        """The rows as CSV, SI, a line per row."""
+        """The rows as CSV, in SI units."""
         rows = [_flat(to_plain(row.values)) for row in self.rows]
         buffer = io.StringIO()
         writer = csv.DictWriter(buffer, list(rows[0]) if rows else [], lineterminator="\n")
@@ -171,7 +171,7 @@ def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
 def make_rows(
     comparison: Comparison, prepared: Sequence[PreparedCondition], jobs_done: Sequence[JobResults]
 ) -> tuple[Row, ...]:
-    """A row per condition and planner, of the jobs that are done, in any order."""
+    """Make a row per condition and planner from the finished jobs, which may be in any order."""
     rows: list[Row] = []
     for i, condition in enumerate(comparison.conditions):
         parts = [part for part in jobs_done if part.job.condition == i]
@@ -211,16 +211,16 @@ def _identity(
 
 
 def summarise(results: NDArray[Any], loadings: NDArray[Any], n_atoms: int) -> dict[str, Any]:
-    """Numbers of loadings, and means with errors over the loadings with a valid plan, in SI.
+    """Numbers of loadings, and means with errors over the loadings with a valid plan, in SI units.
 
     Args:
-        results: :data:`labseq.bench.work.RESULT` (n,), of one planner.
+        results: :data:`labseq.bench.work.RESULT` (n,) of one planner.
         loadings: :data:`labseq.bench.work.LOADING` (n,).
         n_atoms: Number of sites of the target.
 
     Returns:
-        ``n_short`` loadings have fewer atoms than the target, ``n_failed`` no valid plan. Linked batches
-        count as one; an atom that is picked up again counts again. ``n_scans`` and ``scan_s`` are NaN for
+        ``n_short`` loadings have fewer atoms than the target, and ``n_failed`` no valid plan. Linked batches
+        count as one. An atom that is picked up again counts again. ``n_scans`` and ``scan_s`` are NaN for
         a planner whose paper counts batches. ``n_lost`` and ``p_defect_free`` are predicted. ``bound`` is
         the number of lines that cover the vacancies, see :func:`labseq.bench.work.lines_to_cover`, and
         ``ratio_to_bound`` the mean number of batches over the mean bound, both over the loadings whose
@@ -262,16 +262,16 @@ def _table(report: Report) -> list[str]:
 
 
 def notes(report: Report) -> list[str]:
-    """Notes below the table: number of loadings, missing atoms, wrong plans."""
+    """Notes below the table on numbers of loadings, missing atoms and wrong plans."""
     comparison = report.comparison
     extent = plural(comparison.n_loadings, "loading")
     if report.ended_by is not None:
         extent = f"INCOMPLETE: {report.n_done} of {report.n_wanted} loadings"
     if report.rows:
-        extent += f"; bound {report.rows[0]['bound']} batches"
-    lines = ["", f"{extent}; seed {comparison.seed}; {format_quantity(report.duration_s, 'time')}"]
+        extent += f", bound {report.rows[0]['bound']} batches"
+    lines = ["", f"{extent}, seed {comparison.seed}, {format_quantity(report.duration_s, 'time')}"]
     if any(row.scans for row in report.rows):
-        lines.append("scans: what the paper of the planner counts instead of batches, and their duration")
+        lines.append("scans (with their duration) are counted in the planner's paper instead of batches")
     for row in report.rows[:1]:
         if row["n_short"]:
             few = f"{row['n_short']} of {row['n_loadings']} loadings hold fewer atoms"
@@ -285,7 +285,7 @@ def notes(report: Report) -> list[str]:
 
 def _failure(comparison: Comparison, row: Row, failure: Failure) -> list[str]:
     count = (
-        f"{row['n_failed']} of {row['n_loadings']} plans are wrong; the first, of loading {failure.loading}"
+        f"{row['n_failed']} of {row['n_loadings']} plans are wrong, the first of loading {failure.loading}"
     )
     return [
         f"{row['label']}: {count}: {failure.message}",
@@ -310,7 +310,7 @@ def _again(comparison: Comparison, row: Row, loading: int) -> str:
 
 
 def save_histogram(path: Path, report: Report) -> None:
-    """Draw how many batches the planners need, with conditions that differ in parallelism alone, as a PNG.
+    """Draw how many batches the planners need, for conditions that differ only in parallelism, as a PNG.
 
     Args:
         path: The file.
@@ -345,7 +345,7 @@ def save_histogram(path: Path, report: Report) -> None:
 
 
 def draw_histogram(axes: Axes, counts: NDArray[np.int64], colour: str, label: str) -> None:
-    """Draw the share of each number of batches; ``counts``: how often 0, 1, 2, ... were needed."""
+    """Draw the share of each number of batches. ``counts`` has how often 0, 1, 2, ... were needed."""
     occurring = np.flatnonzero(counts)
     if len(occurring):
         first, last = int(occurring[0]), int(occurring[-1])

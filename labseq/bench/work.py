@@ -1,4 +1,4 @@
-"""The work of a comparison: plan for random loadings, check the plans, and count."""
+"""The work of a comparison, which plans for random loadings, checks the plans and counts."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def set_up(comparison: Comparison) -> list[PreparedCondition]:
 
 
 def warm(prepared: list[PreparedCondition]) -> None:
-    """Compile or load all kernels that will be needed, and let planners choose how they plan."""
-    importlib.import_module("labseq.motion.check_kernels")  # else the first plan would wait for them
+    """Compile or load all necessary kernels, and let planners choose how they plan."""
+    importlib.import_module("labseq.motion.check_kernels")  # otherwise the first plan would wait for them
     for runner in [runner for condition in prepared for runner in condition.runners]:
         if isinstance(runner.planner, NeedsWarmUp):
             with _naming(runner, "warm"):
@@ -82,7 +82,7 @@ def warm(prepared: list[PreparedCondition]) -> None:
 
 @contextmanager
 def _naming(runner: Runner, call: str) -> Generator[None]:
-    """Name the planner whose call raises."""
+    """Add the planner's name to an error that its call raises."""
     try:
         yield
     except Exception as error:
@@ -111,13 +111,13 @@ def _motion(condition: Condition) -> MotionSpec:
         Override(f"motion.{key}", value, f"--set {_MOTION_ADDRESS}.{key}={value}")
         for key, value in condition.motion
     ]
-    # validated as in a profile, so that mistakes are reported as there
+    # validated as in a profile, so that mistakes are reported in the same way
     document = Document.of_options(overrides, _MOTION_ADDRESS)
     motion = document.validate(MotionSpec, ("motion",), called=_MOTION_ADDRESS)
     n = condition.degree_of_parallelism
     limit, meaning = min(
-        (motion.max_tweezers, "the most tweezers that can be on at once"),
-        (max(motion.max_row_tones, motion.max_column_tones), "the most tones of an axis"),
+        (motion.max_tweezers, "the maximum number of tweezers on at once"),
+        (max(motion.max_row_tones, motion.max_column_tones), "the maximum number of tones per axis"),
         key=lambda pair: pair[0],
     )
     if n is not None and not 1 <= n <= limit:
@@ -172,14 +172,14 @@ RESULT: Final = np.dtype(
         ("failed", np.bool_),
     ]
 )
-"""Results of one plan; linked batches, which share one pick-up, count as one. Scans are NaN without any.
+"""Results of one plan. Linked batches, which share one pick-up, count as one. Scans are NaN without any.
 
-``moving_s`` is ``motion_s`` without the overheads of batches and cycle; ``n_lost`` and ``p_defect_free``
-are those of :class:`labseq.motion.Survival`.
+``moving_s`` is ``motion_s`` without the overheads of batches and cycle. ``n_lost`` and ``p_defect_free``
+are the same as in :class:`labseq.motion.Survival`.
 """
 
 LOADING: Final = np.dtype([("n_atoms", np.int32), ("n_lines", np.int32)])
-"""Results of one loading; ``n_lines`` as in :func:`lines_to_cover`."""
+"""Results of one loading. ``n_lines`` as in :func:`lines_to_cover`."""
 
 _NO_SCANS: Final = (math.nan, math.nan)
 
@@ -195,7 +195,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A planner raised, or its plan breaks a rule; planner, condition and loading are indices."""
+    """A planner raised, or its plan breaks a rule. Planner, condition and loading are indices."""
 
     planner_entry: int
     condition: int
@@ -220,7 +220,7 @@ class JobResults:
 
 
 def loading_seed(seed: int, index: int) -> int:
-    """The seed of loading ``index``: the first word of the state of the seed's index-th child.
+    """The seed of loading ``index``, which is the first word of the state of the seed's index-th child.
 
     A loading is ``numpy.random.default_rng(loading_seed).random((rows, cols)) <
     loading``, as for ``labseq plan random:ROWSxCOLS@LOADING --seed LOADING_SEED``.
@@ -234,7 +234,7 @@ def loading_seed(seed: int, index: int) -> int:
 
 
 def draw(shape: tuple[int, int], loading: float, seed: int, index: int) -> Occupancy:
-    """Draw a loading, bool ``shape``; see :func:`loading_seed`."""
+    """Draw a loading, bool ``shape``, see :func:`loading_seed`."""
     return np.random.default_rng(loading_seed(seed, index)).random(shape) < loading
 
 
@@ -262,7 +262,7 @@ def lines_to_cover(vacancies: NDArray[np.bool_]) -> NDArray[np.int32]:
     n_loadings, n_rows, n_cols = vacancies.shape
     loading, row, col = np.nonzero(vacancies)
     ones = np.ones(len(loading), np.bool_)
-    shape = (n_loadings * n_rows, n_loadings * n_cols)  # one call for all loadings: one graph
+    shape = (n_loadings * n_rows, n_loadings * n_cols)  # one graph for all loadings, and so one call
     graph = csr_array((ones, (loading * n_rows + row, loading * n_cols + col)), shape=shape)
     matched = maximum_bipartite_matching(graph, perm_type="column")
     return np.count_nonzero(matched.reshape(n_loadings, n_rows) >= 0, axis=1).astype(np.int32)
@@ -298,7 +298,7 @@ def work(prepared: list[PreparedCondition], seed: int, job: Job) -> JobResults:
 
 
 def prepare(comparison: Comparison) -> Callable[[Job], JobResults]:
-    """Prepare for jobs; every planner is called once, so that no measured call is the first one."""
+    """Prepare for jobs. Every planner is called once, so that no measured call is the first."""
     prepared = set_up(comparison)
     warm(prepared)
     for i in range(len(prepared)):
@@ -308,7 +308,7 @@ def prepare(comparison: Comparison) -> Callable[[Job], JobResults]:
 
 def _run(condition: PreparedCondition, runner: Runner, occupancy: Occupancy) -> tuple[Any, ...]:
     input_occupancy = occupancy.copy()  # a planner may change its input
-    # some papers count scans, in which moving tweezers pick up and drop atoms without stopping
+    # some papers count scans, during which moving tweezers pick up and drop atoms without stopping
     scan: Any = getattr(runner.planner, "scan", None)
     scanned: Any = None
     start_s = perf_counter()

@@ -25,13 +25,13 @@ from labseq.units import ZERO_CELSIUS_K, format_quantity
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """A series of exposures that a camera was armed for.
+    """A series of exposures for which a camera was armed.
 
     Attributes:
         n_frames: Number of exposures.
         exposure_s: Exposure time, in seconds.
-        trigger: What starts each exposure, or all of them.
-        em_gain: Mean gain of the EM register; 1 for none.
+        trigger: Trigger of each exposure, or of the whole series.
+        em_gain: Mean gain of the EM register. 1 means no gain.
     """
 
     n_frames: int
@@ -45,12 +45,12 @@ class ExposureResult:
     """The outcome of one exposure.
 
     Attributes:
-        number: Its place in the series as the camera counted it, from 0.
-        image: uint16 (height, width) as the sensor delivers it, not used elsewhere; None if it was lost.
-        fault: What happened to a frame that was lost.
-        exposure_s: Exposure time as the camera made it, in seconds; nan: as asked for.
-        t_start_s: Start of the exposure on the session's clock; nan: worked out from the trigger.
-        device_time_s: The camera's own time stamp, in seconds; nan if it gives none.
+        number: Index in the series as counted by the camera, from 0.
+        image: uint16 (height, width) in the sensor's orientation, not used elsewhere. None for a lost frame.
+        fault: Reason why the frame was lost.
+        exposure_s: Actual exposure time, in seconds. nan means as requested.
+        t_start_s: Start of the exposure on the session's clock. nan means derived from the trigger.
+        device_time_s: The camera's own time stamp, in seconds. nan if it has none.
     """
 
     number: int
@@ -62,20 +62,20 @@ class ExposureResult:
 
 
 class CameraDriver(Camera):
-    """Base of camera drivers: plays the role, and asks a subclass only for what its camera does.
+    """Base of camera drivers. Plays the role, and leaves to a subclass only the camera's own actions.
 
-    It refuses what the camera cannot do before it is asked to, keeps to as many frames as were
-    armed for, finds out when frames are missing, since their numbers have a gap, and gives images their
+    It refuses impossible requests before the camera gets them, returns as many frames as the camera was
+    armed for, detects missing frames by gaps in their numbers, and gives images their
     orientation.
 
-    A subclass implements ``facts``, ``describe`` and the methods below with one underscore; they
+    A subclass implements ``facts``, ``describe`` and the methods below with one underscore. They
     are called in this order: ``_connect``, then for each series ``_start``, ``_fire`` and ``_take``,
     at its end ``_stop``, and ``_disconnect``.
 
     Args:
         context: Name of the camera, and clock.
-        orientation: How images lie relative to the sensor's frames: ``settings.orientation`` of
-            :class:`CameraSettings`, whose ``frame_shape`` is that of the images.
+        orientation: Orientation of images relative to the sensor's frames. It is ``settings.orientation`` of
+            :class:`CameraSettings`, whose ``frame_shape`` is the shape of the images.
     """
 
     def __init__(self, context: Context, orientation: Orientation = Orientation()) -> None:  # noqa: B008 - frozen
@@ -89,23 +89,23 @@ class CameraDriver(Camera):
     @property
     @abstractmethod
     def facts(self) -> CameraFacts:
-        """What the camera can do; also before it is opened."""
+        """What the camera can do, also before it is opened."""
 
     @abstractmethod
     def describe(self) -> Mapping[str, Any]:
-        """Model, serial number, firmware, current settings: JSON-ready values."""
+        """Model, serial number, firmware and current settings, as JSON-ready values."""
 
     @abstractmethod
     def _connect(self) -> None:
-        """Connect to the camera and set what stays the same."""
+        """Connect to the camera and make the settings that stay the same."""
 
     @abstractmethod
     def _disconnect(self) -> None:
-        """Release everything; called in any state, also after a ``_connect`` that failed."""
+        """Release everything. Called in any state, also after a ``_connect`` that failed."""
 
     @abstractmethod
     def _start(self, series: Series) -> None:
-        """Get the camera ready for a series; with the internal trigger, start it."""
+        """Get the camera ready for a series, and start it if the trigger is internal."""
 
     @abstractmethod
     def _fire(self) -> None:
@@ -113,37 +113,37 @@ class CameraDriver(Camera):
 
     @abstractmethod
     def _take(self, timeout_s: float) -> ExposureResult | None:
-        """Wait for what comes next of the series; None if nothing comes in time.
+        """Wait for the next result of the series. None if nothing comes in time.
 
         See :func:`labseq.plugin.wait_for`.
         """
 
     @abstractmethod
     def _stop(self) -> None:
-        """End acquisition, close the shutter, EM gain to 1; called in any state between open and close."""
+        """End acquisition, close the shutter, EM gain to 1. Called in any state between open and close."""
 
     def _end(self) -> None:
-        """End a series, EM gain to 1; the shutter may stay open. Without an override like ``_stop``."""
+        """End a series, EM gain to 1. The shutter may stay open. Without an override, it calls ``_stop``."""
         self._stop()
 
     def open(self) -> None:
-        """Connect to the camera; no effect if it is open.
+        """Connect to the camera. No effect if it is open.
 
         Raises:
-            DeviceError: It does not answer, or is another than the profile says.
+            DeviceError: It does not answer, or is not the camera named in the profile.
         """
         if self._is_open:
             return
         try:
             self._connect()
         except BaseException:
-            with suppress(Exception):  # what went wrong first counts
+            with suppress(Exception):  # only the first error counts
                 self._disconnect()
             raise
         self._is_open = True
 
     def close(self) -> None:
-        """Make safe and disconnect; legal in any state."""
+        """Make safe and disconnect. Legal in any state."""
         try:
             self.safe_state()
         finally:
@@ -151,36 +151,36 @@ class CameraDriver(Camera):
             self._disconnect()
 
     def safe_state(self) -> None:
-        """Stop exposing, close the shutter, EM gain to 1; frames not yet read are dropped."""
+        """Stop exposing, close the shutter, EM gain to 1. Frames not yet read are dropped."""
         self._forget()
         if self._is_open:
             self._stop()
 
     def arm(self, n_frames: int, exposure_s: float, trigger: Trigger) -> None:
-        """Get ready for a series of exposures; frames not yet read are dropped.
+        """Get ready for a series of exposures. Frames not yet read are dropped.
 
         Raises:
-            LimitError: No frames, or an exposure that the camera cannot make, or not in its cycle.
+            LimitError: No frames, or an exposure that the camera cannot make or not within its cycle time.
             DeviceError: Not open, or a trigger that it does not have.
         """
         self._arm(n_frames, exposure_s, trigger, self.facts.em_gain)
 
     def disarm(self) -> None:
-        """End the series, EM gain to 1; frames not yet read are dropped."""
+        """End the series, EM gain to 1. Frames not yet read are dropped."""
         if self._series is not None:
             self._forget()
             self._end()
 
     def trigger(self) -> None:
-        """Start the next exposure of the series; returns at once.
+        """Start the next exposure of the series, and return at once.
 
         Raises:
-            DeviceError: Not armed for it, all exposures made, or still exposing.
+            DeviceError: Not armed for the software trigger, all exposures made, or still exposing.
         """
         self._check_open()
         series, now_s = self._series, self._clock.now()
         if series is None or len(self._fired_s) == series.n_frames:
-            raise DeviceError(self._name, "triggered, but not armed for another frame; call arm() first")
+            raise DeviceError(self._name, "triggered without being armed for another frame; call arm() first")
         if series.trigger != "software":
             raise DeviceError(self._name, f"triggered, but armed for the {series.trigger} trigger")
         is_exposing = len(self._fired_s) > self._n_read
@@ -195,7 +195,7 @@ class CameraDriver(Camera):
         Raises:
             DeviceTimeoutError: No frame came within ``timeout_s``.
             TransientError: One or more frames of the series were lost.
-            DeviceError: Not open, or the camera is gone.
+            DeviceError: Not open, or the camera no longer answers.
         """
         self._check_open()
         series = self._series
@@ -206,7 +206,7 @@ class CameraDriver(Camera):
         if exposure is None:
             raise self._no_frame(timeout_s)
         if exposure.number > self._n_read:
-            self._held = exposure  # it is good: the next call returns it
+            self._held = exposure  # this frame is good, and the next call returns it
             raise self._lost(exposure.number - 1, "the camera's frame numbers have a gap")
         self._n_read = exposure.number + 1
         if exposure.image is None:
@@ -217,10 +217,10 @@ class CameraDriver(Camera):
         return Frame(image, exposure_s, t_start_s, self._name, exposure.number, exposure.device_time_s)
 
     def self_test(self) -> None:
-        """Take a frame without EM gain, if the camera can be triggered; those not yet read are dropped.
+        """Take a frame without EM gain, if the camera can be triggered. Frames not yet read are dropped.
 
         Raises:
-            DeviceError: Not open, no frame came, or it has another shape than the camera says.
+            DeviceError: Not open, no frame came, or its shape is not the shape in the camera's facts.
             TransientError: The frame was lost.
         """
         facts = self.facts
@@ -246,12 +246,12 @@ class CameraDriver(Camera):
         if trigger == "external_start" and facts.cycle_s < exposure_s:
             cycle, least = (format_quantity(s, "time") for s in (facts.cycle_s, exposure_s))
             raise LimitError(f"{self._name}: cycle_time", cycle, f"at least the exposure of {least}")
-        self.disarm()  # the series before may not be over
+        self.disarm()  # an earlier series may still be running
         series = Series(n_frames, exposure_s, trigger, em_gain)
         try:
             self._start(series)
         except BaseException:
-            with suppress(Exception):  # half started it might go on exposing
+            with suppress(Exception):  # a series that is half started might go on exposing
                 self._stop()
             raise
         self._series = series
@@ -267,7 +267,7 @@ class CameraDriver(Camera):
             return exposure.t_start_s
         if exposure.number < len(self._fired_s):
             return self._fired_s[exposure.number]
-        # the time of an external edge is unknown: the frame counts as read as soon as it was ready
+        # the time of an external edge is unknown, so the frame counts as read as soon as it was ready
         return self._clock.now() - exposure_s - self.facts.readout_s
 
     def _no_frame(self, timeout_s: float) -> DeviceTimeoutError:
@@ -279,7 +279,7 @@ class CameraDriver(Camera):
         elif series.trigger == "software" and n_read >= len(self._fired_s):
             reason = "the next one was not triggered"
         elif series.trigger == "external_start" and n_read:
-            reason = f"frame {n_read} of the series that its external trigger started is not ready"
+            reason = f"frame {n_read} of the externally triggered series is not ready"
         elif series.trigger in get_args(LineTrigger):
             line = f", the line {' or '.join(self._trigger_lines)}" if self._trigger_lines else ""
             reason = f"frame {n_read} waits for its external trigger{line}; check the cable"
@@ -294,7 +294,7 @@ class CameraDriver(Camera):
         first, self._n_read = min(self._n_read, last), last + 1
         frames = f"frame {first} was" if first == last else f"frames {first} to {last} were"
         n_frames = self._series.n_frames if self._series is not None else 0
-        return TransientError(f"{frames} lost, of a series of {n_frames}: {reason}", self._name)
+        return TransientError(f"{frames} lost from a series of {n_frames}: {reason}", self._name)
 
     def _check_open(self) -> None:
         if not self._is_open:
@@ -319,33 +319,33 @@ class Cooling:
     temperature_k: Annotated[
         Temperature,
         AfterValidator(_is_temperature_of_sensors),
-        Field(description='of the sensor, "-70 degC"'),
+        Field(description='temperature of the sensor, such as "-70 degC"'),
     ]
     tolerance_k: Annotated[
-        float, Field(gt=0, le=20, description="how far from it the sensor may be, in kelvins")
+        float, Field(gt=0, le=20, description="largest difference from the temperature, in kelvins")
     ] = 1.0
-    steady_s: Annotated[Duration, Field(description="how long it must have been within that")] = 5.0
-    timeout_s: Annotated[PositiveDuration, Field(description="how long it may take")] = 900.0
+    steady_s: Annotated[Duration, Field(description="how long the sensor must keep to tolerance_k")] = 5.0
+    timeout_s: Annotated[PositiveDuration, Field(description="maximum time for cooling")] = 900.0
 
 
 def settle(cooling: Cooling, read_k: Callable[[], float], clock: Clock, name: str) -> None:
-    """Wait until a sensor has its temperature, and keeps it.
+    """Wait until a sensor has reached its temperature and keeps it.
 
     Args:
-        cooling: How cold, how steady, how long.
+        cooling: Temperature, tolerance and times.
         read_k: Reads the temperature, in kelvins.
         clock: The session's clock.
         name: Name of the device, for the error.
 
     Raises:
-        DeviceTimeoutError: It does not get there in time.
+        DeviceTimeoutError: The temperature is not reached in time.
         StopRequested: The operator asked the run to stop.
     """
     start_s = clock.now()
     within_since_s: float | None = None
     while True:
         now_s, temperature_k = clock.now(), read_k()
-        # it may pass through the setpoint before it is steady
+        # the temperature may pass through the setpoint before it is steady
         if abs(temperature_k - cooling.temperature_k) > cooling.tolerance_k:
             within_since_s = None
         elif within_since_s is None:
@@ -363,18 +363,18 @@ def _too_late(cooling: Cooling, temperature_k: float) -> str:
         f"{kelvin - ZERO_CELSIUS_K:.1f} degC" for kelvin in (temperature_k, cooling.temperature_k)
     )
     text = f"the sensor is at {reached} after {waited}; expected {setpoint} within {cooling.tolerance_k:g} K"
-    return f"{text}; look after its cooling water or fan, or choose a higher temperature"
+    return f"{text}; check its cooling water or fan, or choose a higher temperature"
 
 
 BeginExposure: TypeAlias = Callable[[float | None, float | None], object]
-"""Begins an exposure at a time of the session's clock, None for now, of a length, None for the series'."""
+"""Begins an exposure at a time (None: now) on the session's clock, of a length (None: the series' length)."""
 
 
 class SimulatedSensor:
-    """Exposes the simulation for a camera, and knows when each frame could be read.
+    """Exposes the simulation for a camera, and computes when each frame can be read.
 
     A virtual camera reads its frames here. The simulator of a real camera takes only the pixels from here and
-    sends them as that camera would; its driver then waits here until the frame is due. One thread may ask for
+    sends them like the camera. Its driver then waits here until the frame is due. One thread may ask for
     exposures while another takes frames.
 
     Args:
@@ -398,16 +398,16 @@ class SimulatedSensor:
         arm_s: float = 0.0,
         cycle_s: float = 0.0,
     ) -> None:
-        """Get ready for a series; frames not yet taken are dropped.
+        """Get ready for a series. Frames not yet taken are dropped.
 
         Args:
-            series: How many, how long, and what starts them: with the internal trigger the first
-                exposure begins now, the others at the ends of the read-outs before.
-            mode: How the sensor is read.
+            series: Number, length and trigger of the exposures. With the internal trigger the first
+                exposure begins now, and each other at the end of the previous read-out.
+            mode: Region and binning.
             readout_s: From the end of an exposure until its frame can be read, in seconds.
-            period_s: With the internal trigger, from one exposure to the next, in seconds; shorter than
-                both together where they overlap.
-            arm_s: Time that this takes, in seconds.
+            period_s: With the internal trigger, from one exposure to the next, in seconds. Shorter than
+                exposure plus read-out if they overlap.
+            arm_s: Time that arming takes, in seconds.
             cycle_s: After the edge that starts a series, from one exposure to the next, in seconds.
         """
         self._clock.sleep(arm_s)
@@ -423,12 +423,12 @@ class SimulatedSensor:
         """Have the line at the trigger input start the exposures of the series.
 
         Args:
-            expose: Begins one, for as long as the series says or, with bulb, as the line is on.
+            expose: Begins an exposure, as long as in the series or, with bulb, as long as the line is on.
         """
 
         def on_pulse(t_s: float, width_s: float) -> None:
             trigger = "" if self._series is None else self._series.trigger
-            if trigger == "external_start" and math.isnan(self._cycles_from_s):  # later ones do not count
+            if trigger == "external_start" and math.isnan(self._cycles_from_s):  # later edges do not count
                 self._cycles_from_s = t_s
             elif trigger in ("external", "bulb"):
                 expose(t_s, width_s if trigger == "bulb" else None)
@@ -436,10 +436,10 @@ class SimulatedSensor:
         self._world.wire("camera", on_pulse)
 
     def expose_next(self, expose: BeginExposure, timeout_s: float) -> None:
-        """Begin the exposure that the camera times by itself, unless a frame is still to be taken.
+        """Begin the next exposure that the camera times itself, unless a frame is still to be taken.
 
-        With the internal trigger that is the next one of the series; after the edge that starts a series its
-        time is waited for, for at most ``timeout_s``.
+        With the internal trigger this is the next exposure. After the edge that starts a series,
+        this waits until the exposure is due, for at most ``timeout_s``.
         """
         series = self._series
         if series is None or self._frames or self._n_exposed == series.n_frames:
@@ -458,13 +458,13 @@ class SimulatedSensor:
         """Begin the next exposure of the series.
 
         Args:
-            late_s: How much later than it should its frame is due, in seconds: a failure to rehearse.
-            t_start_s: When it begins, on the session's clock; None: now, or with the internal trigger in
+            late_s: Delay of the frame, in seconds, to rehearse a failure.
+            t_start_s: Start on the session's clock. None means now, or with the internal trigger in
                 its turn.
-            exposure_s: How long it lasts, in seconds; None: as the series says.
+            exposure_s: Length, in seconds. None means as in the series.
 
         Returns:
-            Its frame, which can be read when it is due; None if no further exposure is armed.
+            The frame, which can be read when it is due. None if no further exposure is armed.
 
         Raises:
             DeviceError: The simulation is already at a later time.
@@ -474,7 +474,7 @@ class SimulatedSensor:
             if series is None or self._n_exposed == series.n_frames:
                 return None
             if t_start_s is None and series.trigger == "internal":
-                # the camera times itself, however late it is asked
+                # the camera keeps its own times, however late this is called
                 t_start_s = self._armed_s + self._n_exposed * self._period_s
             elif t_start_s is None:
                 t_start_s = self._clock.now()
@@ -485,7 +485,7 @@ class SimulatedSensor:
             return frame
 
     def skip(self) -> None:
-        """Let an exposure of the series pass without a frame: a trigger that was not seen."""
+        """Let an exposure of the series pass without a frame, like a trigger that was not seen."""
         with self._lock:
             self._n_exposed += 1
 
@@ -493,11 +493,11 @@ class SimulatedSensor:
         """Wait on the clock for the oldest frame not yet taken.
 
         Returns:
-            None if it is not due within ``timeout_s``, which has passed then.
+            None if it is not due within ``timeout_s``, after which this returns.
         """
         with self._lock:
             due_s = self._frames[0][0] if self._frames else float("inf")
-        # without the lock, so that another thread can expose meanwhile
+        # without the lock, so that another thread can expose during the wait
         remaining_s = due_s - self._clock.now()
         self._clock.sleep(max(0.0, min(remaining_s, timeout_s)))
         if remaining_s > timeout_s:
@@ -517,7 +517,7 @@ class SimulatedSensor:
 
 
 def nearest(value: int, low: int, high: int, step: int) -> int:
-    """The number nearest to a value, from low to high in steps.
+    """The nearest allowed number to a value, from low to high in steps.
 
     Example:
         >>> nearest(37, 0, 100, 4), nearest(39, 2, 100, 4), nearest(200, 0, 99, 4)
@@ -534,13 +534,13 @@ def check_step(name: str, value: int, bounds: tuple[int, int, int], unit: int = 
         name: Camera and name of the number, for the error.
         value: The number, in pixels of the sensor.
         bounds: Smallest, largest and increment, in the camera's own pixels.
-        unit: Pixels of the sensor per pixel of the camera: the binning.
+        unit: The binning, which is pixels of the sensor per pixel of the camera.
 
     Raises:
-        LimitError: It is out of range or between two steps; the error names the nearest valid one.
+        LimitError: It is out of range or between two steps. The error names the nearest valid number.
     """
     low, high, step = (unit * bound for bound in bounds)
     good = nearest(value, low, high, step)
     if good != value:
-        limit = f"{low} to {high}, in steps of {step}, which the camera can do"
-        raise LimitError(name, value, limit, f"the nearest good one is {good}")
+        limit = f"{low} to {high}, in steps of {step}, as the camera can do"
+        raise LimitError(name, value, limit, f"the nearest possible value is {good}")

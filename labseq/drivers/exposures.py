@@ -20,16 +20,16 @@ ROUNDING_S: Final = 1e-9
 
 @dataclass(slots=True)
 class CameraFaults:
-    """Failures of a simulated camera; may be changed at any time.
+    """Failures of a simulated camera. They may be changed at any time.
 
     Attributes:
-        not_connected: The camera is not there.
-        held: Another program uses it.
-        unplugged: It answers no call any more.
-        unplugged_at: Number of the frame, from 1, at which it is unplugged; 0: never.
-        missed_triggers: How many of the next triggers the camera does not see.
+        not_connected: The camera is not connected.
+        held: Another program uses the camera.
+        unplugged: The camera no longer answers.
+        unplugged_at: Number of the frame, from 1, at which the camera is unplugged. 0 means never.
+        missed_triggers: Number of the next triggers that the camera does not see.
         late_s: Delay of each frame, in seconds.
-        hang: Fetching a frame does not return until this is set; None: it returns.
+        hang: Fetching a frame does not return until this is set. None means that it returns.
     """
 
     not_connected: bool = False
@@ -47,7 +47,7 @@ class ExposureTiming:
 
     Attributes:
         readout_s: From the end of an exposure until its frame can be read, in seconds.
-        period_s: From one exposure to the next where the camera times them, in seconds.
+        period_s: From one exposure to the next if the camera times them, in seconds.
         overlaps: Whether the next exposure may begin during the read-out.
         arm_s: Time that starting a series takes, in seconds.
     """
@@ -62,9 +62,9 @@ IDLE: Final = Series(0, 0.0, "software")
 
 
 class SimulatedExposures:
-    """Exposes at triggers, and moves each frame into the ring buffer when it has been read.
+    """Exposes at triggers, and moves each frame into the ring buffer after its read-out.
 
-    Frames in the ring buffer are numbered from 1; the oldest is overwritten when the buffer is full.
+    Frames in the ring buffer are numbered from 1. The oldest is overwritten when the buffer is full.
 
     Args:
         sensor: Source of the pixels.
@@ -98,13 +98,13 @@ class SimulatedExposures:
         self.empty_buffer()
 
     def empty_buffer(self, n_frames: int = 1) -> None:
-        """Empty the ring buffer, and give it room for so many frames."""
+        """Empty the ring buffer, and give it room for ``n_frames``."""
         self.buffer: OrderedDict[int, Frame] = OrderedDict()
         self._buffer_frames = n_frames
         self.n_arrived = self.n_fetched = 0
 
     def start(self, series: Series, mode: SensorMode, timing: ExposureTiming) -> None:
-        """Arm the sensor; with the internal trigger the first exposure begins."""
+        """Arm the sensor. With the internal trigger the first exposure begins."""
         self._sensor.arm(series, mode, timing.readout_s, timing.period_s, timing.arm_s)
         self._series, self._timing, self._n_left = series, timing, series.n_frames
         self.is_acquiring, self._is_cancelled = True, False
@@ -114,22 +114,22 @@ class SimulatedExposures:
         self.proceed()
 
     def abort(self) -> None:
-        """Stop; frames that were not read out are lost."""
+        """Stop. Frames that were not read out are lost."""
         self.finish()
         self._sensor.clear()
 
     def finish(self) -> None:
-        """End the series; frames in the ring buffer stay."""
+        """End the series. Frames in the ring buffer stay."""
         self.is_acquiring = False
         self._coming.clear()
 
     @property
     def is_busy(self) -> bool:
-        """Whether an exposure, or a read-out that the next one must wait for, goes on."""
+        """True during an exposure, or during a read-out that the next exposure must wait for."""
         return self._is_busy(self._clock.now())
 
     def pulse(self, t_s: float | None = None, width_s: float = 1e-3) -> bool:
-        """A pulse at the trigger input, now or at ``t_s`` of the clock; False if it started no exposure."""
+        """Pulse the trigger input, now or at ``t_s`` of the clock. False if that starts no exposure."""
         t_s = self._clock.now() if t_s is None else t_s
         trigger = self._series.trigger
         if not self.is_acquiring or self._n_left == 0 or self._is_busy(t_s):
@@ -144,13 +144,13 @@ class SimulatedExposures:
 
     @property
     def next_cycle_s(self) -> float:
-        """After an external start, when the next exposure begins, on the session's clock; else nan."""
+        """Start of the next exposure after an external start, on the session's clock. Otherwise nan."""
         if not self.is_acquiring or not self._n_left:
             return math.nan
         return self._cycles_from_s + (self._series.n_frames - self._n_left) * self._timing.period_s
 
     def proceed(self) -> None:
-        """Do what is due by now: frames arrive; where the camera times exposures itself the next begins."""
+        """Let frames arrive that are due by now, and begin the next exposure if the camera times it."""
         now_s = self._clock.now() + ROUNDING_S
         while self.is_acquiring:
             if not self._coming and self._series.trigger == "internal":
@@ -162,7 +162,7 @@ class SimulatedExposures:
             self._arrive(self._coming.popleft()[1])
 
     def expose(self, t_s: float | None = None, exposure_s: float | None = None) -> None:
-        """Begin an exposure, now or at ``t_s``, as long as the series says or ``exposure_s`` seconds."""
+        """Begin an exposure, now or at ``t_s``, of ``exposure_s`` seconds or the length in the series."""
         self._n_left -= 1
         if self.is_missed():
             self._sensor.skip()
@@ -178,14 +178,14 @@ class SimulatedExposures:
             self._arrival.notify_all()
 
     def is_missed(self) -> bool:
-        """Whether the exposure that begins now gives no frame."""
+        """True if the exposure that begins now gives no frame."""
         if self._faults.missed_triggers == 0:
             return False
         self._faults.missed_triggers -= 1
         return True
 
     def keep(self, number: int, frame: Frame) -> bool:
-        """Put a frame that arrives into the ring buffer; False if that fails, which ends the series."""
+        """Put a frame that arrives into the ring buffer. False if that fails, which ends the series."""
         self.n_arrived = number
         self.buffer[number] = frame
         if len(self.buffer) > self._buffer_frames:
@@ -193,9 +193,9 @@ class SimulatedExposures:
         return True
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait in real time for a frame that was not fetched; False if none comes or the wait is cancelled.
+        """Wait in real time for a frame that was not fetched. False if none comes or the wait is cancelled.
 
-        On a virtual clock the frame is there already, or does not come.
+        On a virtual clock the frame has already arrived, or never comes.
         """
         deadline_s = time.monotonic() + timeout_s
         with self._arrival:
@@ -213,7 +213,7 @@ class SimulatedExposures:
                 self._arrival.wait(min(left_s, next_s))
 
     def cancel_wait(self) -> None:
-        """Make a wait return."""
+        """Make a wait in progress return."""
         with self._arrival:
             self._is_cancelled = True
             self._arrival.notify_all()
@@ -222,8 +222,8 @@ class SimulatedExposures:
         """Wait on the session's clock until a frame is due, then in real time until the driver sees it.
 
         Args:
-            look: The driver's way to wait for a frame, for at most so many seconds.
-            timeout_s: How long to wait in all, in seconds.
+            look: The driver's function that waits for a frame, for at most the given seconds.
+            timeout_s: Longest total wait, in seconds.
         """
         clock, start_s = self._clock, self._clock.now()
         expected, due_s = self.n_fetched, self.next_cycle_s
@@ -236,7 +236,7 @@ class SimulatedExposures:
         taken = wait_for(look, max(0.0, timeout_s - (clock.now() - start_s)), clock)
         if taken is None:
             return None
-        for _ in range(self.n_fetched - expected - 1):  # overwritten in the ring buffer, not in the sensor
+        for _ in range(self.n_fetched - expected - 1):  # lost because the ring buffer was overwritten
             frame = self._sensor.take(0.0) or frame
         return replace(taken, t_start_s=frame.t_start_s)
 

@@ -1,4 +1,4 @@
-"""The file of a first contact: what was measured of one device on one computer, sealed by a digest."""
+"""The file of a first contact, with measurements of one device on one computer, sealed by a digest."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ AGAIN: Final = "take all steps again with 'labseq first-contact'"
 
 
 def contact_path(data: Path, serial: str, *, simulated: bool = False) -> Path:
-    """The file of a device. A simulated one never takes the place of the device that it imitates."""
+    """The file of a device. A simulator has another file than the device that it simulates."""
     stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in serial) or "unnamed"
     return data / FOLDER / f"{stem}{'-simulated' if simulated else ''}.json"
 
 
 def this_computer() -> dict[str, str]:
-    """Name of this computer, and a hash that tells it from others with the same name."""
+    """Name of this computer, and a hash that distinguishes it from others with the same name."""
     identity = _machine_id() or f"{uuid.getnode():x}"
     digest = hashlib.sha256(f"labseq first-contact {identity}".encode()).hexdigest()
     return {"node": platform.node(), "machine_id": digest[:16]}
 
 
 def _machine_id() -> str:
-    """The installation's own number; "" where the system has none."""
+    """The installation's own number, or "" if the system has none."""
     with suppress(OSError):
         if sys.platform == "win32":
             import winreg
@@ -49,7 +49,7 @@ def _machine_id() -> str:
 
 
 def digest_of(content: Mapping[str, Any]) -> str:
-    """The digest of all other keys of a file; it reveals an edited file, and protects from nothing."""
+    """The digest of all other keys of a file. It reveals edits, but does not protect against them."""
     rest = {key: value for key, value in content.items() if key != "digest"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
@@ -60,7 +60,7 @@ def write_contact(path: Path, content: Mapping[str, Any]) -> None:
     Raises:
         RecordingError: It cannot be written.
     """
-    plain = parse_object(dumps(content).encode()) or {}  # as it will be read: tuples are lists
+    plain = parse_object(dumps(content).encode()) or {}  # as it will be read, with tuples as lists
     write_file(path, (dumps({**plain, "digest": digest_of(plain)}, indent=1) + "\n").encode())
 
 
@@ -68,24 +68,24 @@ def read_contact(path: Path) -> dict[str, Any]:
     """Read the file of a first contact.
 
     Raises:
-        ConfigError: There is none, it is damaged or edited, or of a newer labseq.
+        ConfigError: There is no file, it is damaged or edited, or it was written by a newer labseq.
     """
     try:
         content = parse_object(read_file(path))
     except RecordingError as error:
-        raise _refused(path, "there is no file of a first contact that can be read", AGAIN) from error
+        raise _refused(path, "there is no readable file of a first contact", AGAIN) from error
     if content is None or "digest" not in content:
         raise _refused(path, "this is not the file of a first contact", AGAIN)
     if content.get("schema") != SCHEMA:
         what = f"its schema is {content.get('schema')!r}; expected {SCHEMA}"
         raise _refused(path, what, "use the labseq that wrote it, or " + AGAIN)
     if content["digest"] != digest_of(content):
-        raise _refused(path, "it was edited after it was measured: its digest does not match", AGAIN)
+        raise _refused(path, "its digest does not match, so it was edited after the measurement", AGAIN)
     return content
 
 
 def check_belongs(content: Mapping[str, Any], card: Mapping[str, Any], path: Path) -> None:
-    """Check that a first contact was with this device, its present software, and this computer.
+    """Check that a first contact was made with this device, its present software, and this computer.
 
     Args:
         content: What :func:`read_contact` returned.
@@ -93,14 +93,14 @@ def check_belongs(content: Mapping[str, Any], card: Mapping[str, Any], path: Pat
         path: The file, for the message.
 
     Raises:
-        ConfigError: It was another one; says which part differs.
+        ConfigError: A part differs. The error names the part.
     """
     for key, value in card.items():
         if (measured := content["card"].get(key)) != value:
-            raise _refused(path, f"it was measured with {key} {measured}, and the device has {value}", AGAIN)
+            raise _refused(path, f"it was measured with {key} {measured}, but the device has {value}", AGAIN)
     computer, here = content["computer"], this_computer()
     if computer["machine_id"] != here["machine_id"]:
-        what = f"it was measured on another computer, '{computer['node']}', and this is '{here['node']}'"
+        what = f"it was measured on another computer, '{computer['node']}', but this is '{here['node']}'"
         raise _refused(path, what, AGAIN + " here")
 
 

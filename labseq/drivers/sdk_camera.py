@@ -1,4 +1,4 @@
-"""What drivers share whose cameras are set through a vendor's library: cooling, and times that it rounds."""
+"""Shared code for cameras that are set through a vendor's library, for cooling and rounded times."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ MAX_LENGTHENING: Final = 1.01
 
 
 def without_rounding(value: float, wanted: float, rounding: float = 1e-6) -> float:
-    """The library's value, or the wanted one if they differ by rounding only.
+    """The library's value, or the requested value if they differ only by rounding.
 
     Args:
         value: Value that the library reports.
-        wanted: Value that was asked for.
+        wanted: The requested value.
         rounding: Largest relative difference that counts as rounding.
 
     Example:
@@ -35,7 +35,7 @@ class SdkCamera(CameraDriver):
 
     Args:
         settings: The sensor's settings.
-        cooling: Temperature of the sensor; None: the cooler is left as it is.
+        cooling: Temperature of the sensor. None leaves the cooler unchanged.
         context: Name of the camera, and clock.
     """
 
@@ -49,7 +49,7 @@ class SdkCamera(CameraDriver):
 
     @property
     def settling_timeout_s(self) -> float:
-        """Maximum time for cooling, in seconds; 0 without cooling."""
+        """Maximum time for cooling, in seconds. 0 without cooling."""
         return 0.0 if self._cooling is None else self._cooling.timeout_s
 
     def settle(self) -> None:
@@ -66,7 +66,7 @@ class SdkCamera(CameraDriver):
         """Refuse a `line_trigger` that the camera does not have."""
         wanted = self.facts.line_trigger
         if wanted not in triggers and wanted != "external":
-            text = f"this camera has no {wanted} trigger with these settings; it has {one_of(triggers)}"
+            text = f"this camera has no {wanted} trigger with these settings, only {one_of(triggers)}"
             raise DeviceError(self._name, f"{text}; set another `line_trigger`")
 
     def _check_exposure(self, made_s: float, wanted_s: float, hint: str) -> None:

@@ -22,7 +22,7 @@ class RegionSettings(Settings):
 
 
 class OrientationSettings(Settings):
-    """Orientation of the images relative to the sensor; sites are places in the image."""
+    """Orientation of the images relative to the sensor. Positions of sites refer to the image."""
 
     transpose: bool = Field(
         default=False, description="exchange rows and columns of the sensor's frame, before `flip`"
@@ -40,11 +40,11 @@ class OrientationSettings(Settings):
 
 
 class CameraSettings(OrientationSettings):
-    """Settings of the sensor that every camera has; a plugin adds its own."""
+    """Settings of the sensor that every camera has. A plugin adds its own."""
 
     region: RegionSettings | None = Field(
         default=None,
-        description="the part of the sensor that is read, in the orientation of the sensor; none: all of it",
+        description="the part of the sensor that is read, in the sensor's orientation (default: all of it)",
     )
     binning: PositiveInt = Field(
         default=1, description="pixels of the sensor per pixel of a frame, along each axis"
@@ -52,17 +52,17 @@ class CameraSettings(OrientationSettings):
     max_exposure: PositiveDuration = Field(default=10.0, description="longest exposure")
     line_trigger: LineTrigger = Field(
         default="external",
-        description="what the line with `triggers: camera` does: `external`: each edge starts an exposure; "
-        "`external_start`: one edge starts all exposures of a series, every `cycle_time`; `bulb`: the camera "
-        "exposes as long as the line is on",
+        description="with `external` each edge of the line with `triggers: camera` starts an exposure, with "
+        "`external_start` one edge starts a series with an exposure every `cycle_time`, and with `bulb` the "
+        "camera exposes while the line is on",
     )
     cycle_time: PositiveDuration | None = Field(
         default=None,
-        description="with `external_start`: from the start of one exposure to that of the next",
+        description="with `external_start`, time from the start of one exposure to the start of the next",
     )
     arming_time: Duration = Field(
         default=0.0,
-        description="time from arming for a series until it can be triggered, for budgets; simulated cameras "
+        description="time from arming until a series can be triggered, for budgets. Simulated cameras "
         "take this long",
     )
 
@@ -74,7 +74,7 @@ class CameraSettings(OrientationSettings):
         return SensorMode(place, self.binning)
 
     def frame_shape(self, sensor_shape: tuple[int, int] | None) -> tuple[int, int] | None:
-        """(height, width) of the images; None if neither the sensor nor a region is known."""
+        """(height, width) of the images. None if neither the sensor nor a region is known."""
         if sensor_shape is None and self.region is None:
             return None
         return self.orientation.shape(self.mode.frame_shape(sensor_shape or (0, 0)))
@@ -90,8 +90,8 @@ class CameraSettings(OrientationSettings):
 
         Args:
             readout_s: From the end of an exposure until the frame can be read, in seconds.
-            frame_shape: (height, width) of the images; None if not known.
-            triggers: What may start its exposures; by default all that there are.
+            frame_shape: (height, width) of the images. None if unknown.
+            triggers: Triggers that may start exposures. Default all.
             **more: Further attributes of :class:`labseq.plugin.CameraFacts`, such as ``em_gain``.
         """
         settings = {
@@ -105,7 +105,7 @@ class CameraSettings(OrientationSettings):
         )
 
     def sensor_conflict(self, sensor_shape: tuple[int, int]) -> str:
-        """Why region and binning do not fit a sensor of (height, width) pixels; "" if they do."""
+        """Why region and binning do not fit a sensor of (height, width) pixels, or "" if they do."""
         y, x, height, width = self.mode.region or (0, 0, *sensor_shape)
         if y + height > sensor_shape[0] or x + width > sensor_shape[1]:
             rows, cols = sensor_shape
@@ -117,7 +117,7 @@ class CameraSettings(OrientationSettings):
         """The simulation whose frames a simulated camera takes, and (height, width) of its sensor.
 
         Raises:
-            ConfigError: There is none, it does not describe its sensor, or the region is beyond it.
+            ConfigError: The simulation is missing or describes no sensor, or the region is beyond the sensor.
         """
         simulation = context.simulation
         if simulation is None or simulation.sensor_shape is None:
@@ -133,7 +133,7 @@ class CameraSettings(OrientationSettings):
             raise ValueError("`external_start` needs a `cycle_time`, at which the camera exposes")
         if self.line_trigger != "external_start" and self.cycle_time is not None:
             raise ValueError(
-                "`cycle_time` needs `line_trigger: external_start`; else each exposure has its trigger"
+                "`cycle_time` needs `line_trigger: external_start`; else each exposure has its own trigger"
             )
         return self
 
@@ -150,4 +150,4 @@ def _unbinnable(height: int, width: int, binning: int) -> str:
     if height % binning == 0 and width % binning == 0:
         return ""
     text = f"{height} x {width} pixels cannot be binned by {binning}"
-    return f"{text}; choose a `region` whose height and width are multiples of it"
+    return f"{text}; choose a `region` whose height and width are multiples of the binning"

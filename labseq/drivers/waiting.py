@@ -11,21 +11,21 @@ from labseq.roles import Clock
 T = TypeVar("T")
 
 SLICE_S: Final = 0.02
-"""Longest single wait in seconds: how soon a stop request is seen."""
+"""Longest single wait, in seconds, after which a stop request is noticed."""
 
 
 def wait_for(poll: Callable[[float], T | None], timeout_s: float, clock: Clock) -> T | None:
     """Wait until something comes from a device that runs in real time.
 
-    If nothing comes, a virtual clock moves on by the whole wait, too.
+    If nothing comes, a virtual clock also advances by the whole wait.
 
     Args:
-        poll: Waits for at most so many seconds; None if nothing came.
-        timeout_s: How long to wait in all, in seconds; 0 looks once.
-        clock: The session's clock: asked for a stop request before each look.
+        poll: Waits for at most the given seconds. None if nothing came.
+        timeout_s: Longest total wait, in seconds. 0 looks once.
+        clock: The session's clock, which is checked for a stop request before each look.
 
     Returns:
-        What came; None if nothing did.
+        The result of ``poll``. None if nothing came.
 
     Raises:
         StopRequested: The operator asked the run to stop.

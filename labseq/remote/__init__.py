@@ -1,1 +1,1 @@
-"""Serves devices of this computer to another one that runs sequences; keys of computers."""
+"""Serves devices of this computer to another computer that runs sequences, and manages keys."""

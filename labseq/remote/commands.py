@@ -15,7 +15,7 @@ Examples:
 
 keys = typer.Typer(
     name="keys",
-    help="Keys by which computers that share devices recognise each other.",
+    help="Keys with which computers that share devices recognise each other.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -29,18 +29,18 @@ def new(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="NAME", help="Name of the files; default: that of this computer.", show_default=False
+            metavar="NAME", help="Name of the files. Default: this computer's name.", show_default=False
         ),
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Folder of keys; default: LABSEQ_KEYS.", show_default=False),
+        typer.Option(metavar="FOLDER", help="Folder of keys. Default: LABSEQ_KEYS.", show_default=False),
     ] = None,
 ) -> None:
-    """Make the key of this computer: a secret file, and a public one for the other computers.
+    """Make the key of this computer, as a secret file and a public file for other computers.
 
-    Each computer keeps the public keys of those it works with in the folder `known` of its folder of keys.
-    Deleting a file there withdraws the key, also from a computer that is connected.
+    Each computer keeps the public keys of the other computers in the subfolder `known` of its key folder.
+    Deleting a file there revokes the key at once, even for a connected computer.
     """
     import platform
 
@@ -49,8 +49,8 @@ def new(
 
     require_packages()
     secret, public = new_keys(name or platform.node(), folder or keys_root())
-    say(f"{secret}: secret; it stays on this computer")
-    say(f"{public}: public; copy it into the folder `known` of the keys of other computers")
+    say(f"{secret}: secret, stays on this computer")
+    say(f"{public}: public, to be copied into the folder `known` in the key folders of other computers")
 
 
 def serve_devices(
@@ -58,24 +58,24 @@ def serve_devices(
     bind: Annotated[
         str,
         typer.Option(
-            metavar="ADDRESS", help="Address and port to listen on; each device has one of the next ports."
+            metavar="ADDRESS", help="Address and port to listen on. The devices use the next ports."
         ),
     ] = "tcp://127.0.0.1:5760",
     device: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Serve only this device; may be repeated. Default: all real ones, or all if none is real.",
+            help="Serve only this device. May be repeated. Default: all real ones, or all if none is real.",
             show_default=False,
         ),
     ] = None,
     plain: Annotated[
-        bool, typer.Option("--plain", help="Without keys, for programs on this computer only.")
+        bool, typer.Option("--plain", help="Serve without keys, only to programs on this computer.")
     ] = False,
     overrides: Overrides = None,
     _plugins: Plugins = None,
 ) -> None:
-    """Serve the devices of a profile to a labseq on another computer, which uses them as its own.
+    """Serve the devices of a profile to a labseq on another computer, which uses them like its own.
 
     Each device is tested and made safe first. If a client disappears, its devices are made safe within a
     second. Ctrl-C makes all devices safe and ends the server.

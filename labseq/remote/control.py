@@ -1,4 +1,4 @@
-"""The control of a server of devices: sessions begin and end here, and calls are aborted.
+"""The control of a device server, where sessions begin and end and calls are aborted.
 
 Its thread makes no calls into drivers, so it always answers.
 """
@@ -21,28 +21,28 @@ from labseq.remote.sessions import CLOSED, Faults, Session
 from labseq.wire import LOST_S, PROTOCOL, Connections, MessageError, pack, report_error, unpack
 
 MAX_SESSIONS: Final = 64
-"""Maximum number of connections at a time; a client that makes more is faulty."""
+"""Maximum number of connections at a time. A client that makes more is faulty."""
 _FIELDS: Final[Mapping[str, Mapping[str, type]]] = {
     "hello": {"protocol": int, "labseq": str, "who": str, "device": str, "kind": str},
     "beat": {"session": bytes},
     "bye": {"session": bytes},
     "abort": {"session": bytes, "number": int},
 }
-"""Request -> its fields, and their types."""
+"""Request -> its fields and their types."""
 
 
 class Control:
-    """Answers what clients ask while their calls may hang, and notices which of them have disappeared.
+    """Answers clients even while their calls hang, and notices when clients disappear.
 
     Attributes:
         ports: Name of a device -> its port.
-        failure: What ended its thread, or None.
+        failure: The error that ended its thread, or None.
 
     Args:
-        devices: The devices that are served, by name.
-        port: That of the control; the devices have the next ones.
-        keys: Who may connect.
-        socket: A ROUTER; used in the control's thread only.
+        devices: The served devices, by name.
+        port: Port of the control. The devices have the next ports.
+        keys: Keys of the clients that may connect.
+        socket: A ROUTER, used only in the control's thread.
     """
 
     def __init__(self, devices: Mapping[str, ServedDevice], port: int, keys: KnownKeys, socket: Any) -> None:
@@ -99,7 +99,7 @@ class Control:
 
     def _end_lost_sessions(self, now_s: float, passed_s: float, ended: set[tuple[int, int]]) -> None:
         """End the sessions of clients that have disappeared, or whose key was withdrawn."""
-        # after a long pause this computer stood still, and could not receive heartbeats
+        # after a long pause this computer was suspended, and could not receive heartbeats
         stood_still_s = passed_s if passed_s > LOST_S / 2 else 0.0
         for device in self._devices.values():
             for session in list(device.sessions.values()):
@@ -128,7 +128,7 @@ class Control:
             return pack({"n": number, "error": report_error(failure)})
 
     def _value(self, message: Mapping[str, Any], frame: Any) -> Any:
-        """Do what a message asks for; its frame names the client's key and connection."""
+        """Carry out a message. Its frame names the client's key and connection."""
         import zmq
 
         peer = str(frame.get("User-Id")) if self._keys.own is not None else ""

@@ -1,6 +1,6 @@
-"""The driver that a server constructs for a client, and what the client may call.
+"""The driver that a server constructs for a client, and the methods that the client may call.
 
-Each client has its own driver object. Several may exist at a time, but only one of them is open.
+Each client has its own driver object. Several may exist at a time, but only one may be open.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ METHODS: Final[Mapping[str, frozenset[str]]] = {
 }
 """Kind of device -> methods that clients may call, besides ``open`` and ``close``."""
 DESCRIBING: Final = frozenset({"describe", "versions"})
-"""Methods that are called on the driver of the client that has opened the device, whichever client asks."""
+"""Methods that any client may call, always on the driver of the client that has opened the device."""
 _WITHOUT_OPENING: Final = DESCRIBING | {"safe_state", "warm", "check_program", "check_command"}
 
 _HARDWARE_PROPERTIES: Final = ("settling_timeout_s", "idle_output")
@@ -56,10 +56,10 @@ class DeviceEntry:
     """A device of the profile that is served.
 
     Attributes:
-        name: Its role, or its name in the profile.
+        name: Role of the device, or its name in the profile.
         plugin: Its plugin.
-        simulation: The plugin of the simulation that it acts on, if it is simulated.
-        identities: What identifies the hardware, for its marker; none if it is simulated.
+        simulation: Plugin of the simulation on which it acts, if it is simulated.
+        identities: Identifiers of the hardware, for its marker. None if it is simulated.
     """
 
     name: str
@@ -74,7 +74,7 @@ class DeviceEntry:
 
     @property
     def key(self) -> str:
-        """Name of this server in the device's marker, where a run has its profile."""
+        """Name of this server in the device's marker, in place of a run's profile."""
         return f"labseq serve-devices {self.name}"
 
 
@@ -82,7 +82,7 @@ def _checked_context(context: Any) -> tuple[str, tuple[LineSpec, ...]]:
     """Name and lines in a client's context, after the types of all its fields have been checked.
 
     Raises:
-        DeviceError: One is wrong.
+        DeviceError: A field is wrong.
     """
     kinds = {"name": str, "grid": SiteGrid, "motion": MotionSpec, "lines": list, "calibrations": dict}
     if not isinstance(context, dict):
@@ -91,9 +91,9 @@ def _checked_context(context: Any) -> tuple[str, tuple[LineSpec, ...]]:
         if type(context.get(key)) is not kind:
             raise DeviceError("server", f"'{key}' of the context is not of the type {kind.__name__}")
     if not all(isinstance(line, LineSpec) for line in context["lines"]):
-        raise DeviceError("server", "'lines' of the context has other values than lines")
+        raise DeviceError("server", "'lines' of the context contains values that are not lines")
     if not all(isinstance(entry, CalibrationEntry) for entry in context["calibrations"].values()):
-        raise DeviceError("server", "'calibrations' of the context has other values than calibrations")
+        raise DeviceError("server", "'calibrations' of the context contains values that are not calibrations")
     return context["name"], tuple(context["lines"])
 
 
@@ -104,15 +104,15 @@ class ClientDriver:
 
     Attributes:
         device: The driver.
-        clock: Its time.
+        clock: Clock of the driver.
         is_open: Whether the client has opened the device and may act with it.
-        is_safe: Whether nothing was called since a safe state that succeeded.
+        is_safe: Whether nothing was called since the last successful safe state.
 
     Args:
         entry: The device.
         client_context: The client's context: name, grid, motion, lines and calibrations.
-        abort: Ends waits of the driver.
-        report: Receives what happens, for the operator.
+        abort: Flag that ends waits of the driver.
+        report: Receives lines of text for the operator.
 
     Raises:
         ConfigError: The driver refuses its settings, or a simulated device would need the client's lines.
@@ -151,7 +151,7 @@ class ClientDriver:
         self._simulation = devices.get("simulation")
 
     def abilities(self) -> list[str]:
-        """The methods that the driver has itself; the client need not ask for the others."""
+        """The optional methods that the driver has. The client need not ask for the others."""
         base = ROLES[self._entry.kind].base
         return [name for name in METHODS[self._entry.kind] if overrides(self.device, getattr(base, name))]
 
@@ -179,7 +179,7 @@ class ClientDriver:
         """Call a method of the driver.
 
         Raises:
-            DeviceError: A client may not call it, or has to open the device first.
+            DeviceError: A client may not call the method, or has to open the device first.
         """
         if name not in METHODS[self._entry.kind]:
             raise DeviceError(self._entry.name, f"a client cannot call {name[:40]!r}")
@@ -212,7 +212,7 @@ class ClientDriver:
         return state
 
     def make_safe_during_call(self, timeout_s: float = 5.0) -> str:
-        """Make the device safe while a call hangs in its thread; returns why that failed, or "".
+        """Make the device safe while a call hangs in its thread. Returns why that failed, or "".
 
         If it fails or takes longer than ``timeout_s``, the watchdog switches the device off.
         """
@@ -221,11 +221,11 @@ class ClientDriver:
             failure = attempt(guard, self._entry.name, timeout_s, self.device.safe_state)
         guard.end()
         if failure is not None and self._watchdog is not None:
-            self._watchdog.end()  # it switches off what it was not asked to forget
+            self._watchdog.end()  # it switches off all outputs that it was not told to forget
         return "" if failure is None else str(failure)
 
     def close(self) -> list[str]:
-        """Make the device safe, unless it is, and close it; returns what failed."""
+        """Make the device safe, unless it is, and close it. Returns the failures."""
         failures: list[str] = []
 
         def try_call(method: Callable[[], object], name: str) -> None:
@@ -255,7 +255,7 @@ class ClientDriver:
         self.is_safe = True
 
     def _give_up(self) -> None:
-        """Let other clients use the device; the watchdog switches it off unless it is safe."""
+        """Let other clients use the device. The watchdog switches it off unless it is safe."""
         self.is_open = False
         if self._watchdog is not None:
             if self.is_safe:

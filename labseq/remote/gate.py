@@ -1,7 +1,7 @@
-"""The ports of a server of devices: they bound the connections, and pass bytes on to the sockets of ZeroMQ.
+"""The ports of a device server, which limit the connections and pass bytes on to the sockets of ZeroMQ.
 
-ZeroMQ accepts any number of connections, and cannot close one of them: a socket that stops to listen cuts off
-all of its clients. So the sockets of ZeroMQ are reached through these ports only.
+ZeroMQ accepts any number of connections and cannot close a single one. A socket that stops listening drops
+all its clients. So the sockets of ZeroMQ are only reached through these ports.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from labseq.wire.messages import MAX_MESSAGE
 _SIZE: Final = 1 << 18
 """Bytes that are passed on at a time."""
 MAX_UNANSWERED: Final = MAX_MESSAGE + (1 << 20)
-"""Bytes that a client may send before it gets an answer, and a quarter of those of all clients together.
+"""Bytes that a client may send before it gets an answer. All clients together may send four times as many.
 
-ZeroMQ keeps a message of any number of parts until its last one has come.
+ZeroMQ holds a message of any number of parts until the last part has come.
 """
 UNREAD_S: Final = 10.0
 """Longest time that bytes for a client may wait until it reads, in seconds."""
 _BEFORE_KEY: Final = 64 + 170 + 12
 """Bytes that ZeroMQ sends to a client whose key it does not know: greeting, WELCOME, ERROR (ZMTP 3.1, CURVE).
-READY, for one that it knows, is longer than ERROR."""
+READY, for a known client, is longer than ERROR."""
 _BEFORE_READY: Final = 64
-"""The same without keys: the greeting."""
+"""The same without keys, which is the greeting."""
 
 
 @dataclass(eq=False, slots=True)
 class _Side:
-    """One of the two sockets of a connection, and the bytes that it has not taken yet.
+    """One of the two sockets of a connection, and the bytes still to be written to it.
 
     Attributes:
         socket: The socket.
         waiting: The bytes.
-        took_s: When it last took any.
+        took_s: Time when the socket last took bytes.
     """
 
     socket: socket.socket
@@ -56,15 +56,15 @@ class _Side:
 
 @dataclass(eq=False, slots=True)
 class _Connection:
-    """A client, and the socket of ZeroMQ that it reaches.
+    """A client, and the socket of ZeroMQ to which it is connected.
 
     Attributes:
         client: The client's side.
         server: ZeroMQ's side.
         address: The client's address.
-        until_s: When it has to have shown its key (without keys: spoken ZeroMQ); 0 for one that has.
-        n_sent: Number of bytes that ZeroMQ has sent to it.
-        n_unanswered: Number of bytes that have come from it since then.
+        until_s: Deadline for showing its key, or without keys for speaking ZeroMQ. 0 once it has.
+        n_sent: Number of bytes that ZeroMQ has sent to the client.
+        n_unanswered: Number of bytes received from the client since ZeroMQ last sent some.
     """
 
     client: _Side
@@ -79,15 +79,15 @@ class Gate:
     """Listens on the ports of a server.
 
     Attributes:
-        addresses: Where the sockets of ZeroMQ have to listen, one for each port.
-        failure: What ended its thread, or None.
+        addresses: Addresses where the sockets of ZeroMQ have to listen, one for each port.
+        failure: The error that ended its thread, or None.
 
     Args:
         host: Address to listen on.
         port: The first port.
         n_ports: Number of ports, one after the other.
         has_keys: Whether clients need keys.
-        report: Receives what happens, for the operator.
+        report: Receives lines of text for the operator.
 
     Raises:
         ConfigError: A port cannot be used.
@@ -127,7 +127,7 @@ class Gate:
         """Start its thread.
 
         Args:
-            addresses: Where the sockets of ZeroMQ listen now.
+            addresses: Addresses where the sockets of ZeroMQ now listen.
         """
         self._targets = dict(zip(self._listening, addresses, strict=True))
         for listening in self._listening:
@@ -135,7 +135,7 @@ class Gate:
         self._thread.start()
 
     def accept_no_more(self) -> None:
-        """Stop listening; connections stay."""
+        """Stop listening. Connections stay."""
         self._ending.set()
 
     def end(self) -> None:
@@ -175,15 +175,15 @@ class Gate:
     def _accept(self, listening: Any) -> None:
         try:
             client, (address, *_) = listening.accept()
-        except OSError:  # it has left, or there is no file left to open
+        except OSError:  # the client has left, or no more files can be opened
             return
         if len(self._open) >= self._limit:
-            self._refuse(address, f"there are {self._limit} connections")
+            self._refuse(address, f"there are already {self._limit} connections")
             client.close()
             return
         try:
             server = _connect(self._targets[listening])
-        except OSError:  # no file is left, or the server ends
+        except OSError:  # no more files can be opened, or the server ends
             client.close()
             return
         connection = _Connection(_Side(client), _Side(server), address, time.monotonic() + HANDSHAKE_S)
@@ -195,13 +195,13 @@ class Gate:
         self._limit_newcomers()
 
     def _limit_newcomers(self) -> None:
-        """Close the oldest newcomer of the address that has most of them, if there are too many."""
+        """If there are too many newcomers, close the oldest one of the address that has the most."""
         newcomers = [connection for connection in self._open if connection.until_s]
         if len(newcomers) <= self._limit // 3:
             return
         ((address, _),) = Counter(connection.address for connection in newcomers).most_common(1)
         oldest = next(connection for connection in newcomers if connection.address == address)
-        self._refuse(address, "too many of its connections have shown no key")
+        self._refuse(address, "too many connections from there have shown no key")
         self._close(oldest)
 
     def _close_late(self) -> None:
@@ -214,14 +214,14 @@ class Gate:
             self._close(connection)
 
     def _refuse(self, address: str, why: str) -> None:
-        """Report a connection that is closed; a flood of them must not fill the log."""
+        """Report a connection that is closed, but do not let a flood of them fill the log."""
         self._n_refused += 1
         if self._n_refused & (self._n_refused - 1) == 0:
             so_far = f" ({self._n_refused} connections refused so far)" if self._n_refused > 1 else ""
             self._report(f"a connection from {address} was closed: {why}{so_far}")
 
     def _pass(self, connection: _Connection, ready_socket: Any, ready: int) -> None:
-        """Pass bytes on from the socket that is ready to the other one, or write what waits for it."""
+        """Pass bytes on from the ready socket to the other one, or write the bytes that wait for it."""
         if connection not in self._open:
             return  # it was closed a moment ago
         side, other = connection.client, connection.server
@@ -240,7 +240,7 @@ class Gate:
             self._close(connection)
 
     def _receive(self, connection: _Connection, side: _Side, other: _Side) -> None:
-        """Pass on what has come."""
+        """Pass on the received bytes."""
         n = side.socket.recv_into(self._buffer)
         if n == 0:
             raise ConnectionResetError
@@ -257,7 +257,7 @@ class Gate:
         other.waiting, other.took_s = memoryview(bytes(self._buffer[n_sent:n])), time.monotonic()
 
     def _limit_unanswered(self, connection: _Connection) -> None:
-        """Close a connection that sends too much; of all together too much, the one that sent most."""
+        """Close a connection that sends too much, or if all together do, the connection that sent most."""
         in_all = sum(peer.n_unanswered for peer in self._open)
         if connection.n_unanswered <= MAX_UNANSWERED and in_all <= 4 * MAX_UNANSWERED:
             return
@@ -268,7 +268,7 @@ class Gate:
         self._close(most)
 
     def _watch(self, connection: _Connection) -> None:
-        """Read from a socket only while the other one takes what comes, so that nothing piles up."""
+        """Read from a socket only while the other one takes the bytes, so that nothing piles up."""
         for side, other in (
             (connection.client, connection.server),
             (connection.server, connection.client),
@@ -286,22 +286,22 @@ class Gate:
     def _close(self, connection: _Connection) -> None:
         self._open.remove(connection)
         for side in (connection.client, connection.server):
-            with suppress(KeyError):  # it waits for the other one
+            with suppress(KeyError):  # not registered while it waits for the other one
                 self._selector.unregister(side.socket)
             side.socket.close()
 
 
 def _connection_limit() -> int:
-    """How many connections there may be, so that drivers can still open files.
+    """The maximum number of connections, so that drivers can still open files.
 
-    A connection is three files on POSIX: two sockets here, and one of ZeroMQ. They get half of all files.
+    A connection is three files on POSIX (two sockets here and one of ZeroMQ). They get half of all files.
     """
     if sys.platform == "win32":
         return 128
     import resource
 
     n_files, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if 0 <= n_files < 1024:  # 256 on a Mac; select(), which drivers use, cannot watch more than 1024
+    if 0 <= n_files < 1024:  # 256 on a Mac. select(), which drivers use, cannot watch more than 1024
         n_files = 1024 if most == resource.RLIM_INFINITY else min(1024, most)
         resource.setrlimit(resource.RLIMIT_NOFILE, (n_files, most))
     return min(n_files, 1024) // 6 if n_files > 0 else 170
@@ -315,7 +315,7 @@ def _listen(host: str, port: int) -> socket.socket:
         both = host == "::" and socket.has_dualstack_ipv6()
         listening = socket.create_server((host, port), family=family, backlog=128, dualstack_ipv6=both)
     except (OSError, OverflowError) as error:
-        hint = "choose another one with --bind; perhaps the server is already running"
+        hint = "choose another port with --bind, or check whether the server is already running"
         reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(Problem(f"{host}:{port} cannot be used: {reason}", hint=hint)) from error
     listening.setblocking(False)

@@ -1,4 +1,4 @@
-"""Which clients may connect to a server of devices: those whose public keys are in its folder of keys."""
+"""The clients that may connect to a device server, whose public keys are in its folder of keys."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from labseq.wire import keys_root, known_keys
 from labseq.wire.keys import Keys
 
 READ_S: Final = 0.2
-"""How often the keys are read: a key that was deleted is withdrawn from a client that is connected, too."""
+"""Interval at which the keys are read, in seconds. Deleting a key also ends a connected client's session."""
 
 
 class KnownKeys:
     """The public keys of clients, and their names.
 
     Attributes:
-        own: Keys of this computer; None for a server that needs no keys.
+        own: Keys of this computer. None for a server that needs no keys.
 
     Args:
-        report: Receives what happens, for the operator.
+        report: Receives lines of text for the operator.
     """
 
     def __init__(self, own: Keys | None, report: Callable[[str], object]) -> None:
@@ -35,14 +35,14 @@ class KnownKeys:
     @property
     def names(self) -> str:
         """The clients' names, for the operator."""
-        return ", ".join(sorted(self._names.values())) or f"none: put public keys into {keys_root()}/known"
+        return ", ".join(sorted(self._names.values())) or f"none (put public keys into {keys_root()}/known)"
 
     def name(self, peer: str) -> str:
-        """What the client with this key is called."""
+        """Name of the client with this key."""
         return self._names.get(peer.encode(), "this computer")
 
     def client_of(self, frames: Sequence[Any]) -> object:
-        """Who sent a message: the client's key, or its connection where no keys are needed."""
+        """The sender of a message, as the client's key or without keys its connection."""
         return frames[0].bytes if self.own is None else frames[-1].get("User-Id")
 
     def is_known(self, peer: str) -> bool:
@@ -50,7 +50,7 @@ class KnownKeys:
         return self.own is None or peer.encode() in self._names
 
     def read_again(self) -> None:
-        """Read the keys, if it is time; if that fails, report it once and keep the previous ones."""
+        """Read the keys if it is time. If that fails, report it once and keep the previous keys."""
         if self.own is None or time.monotonic() < self._read_s + READ_S:
             return
         self._read_s, failure = time.monotonic(), ""
@@ -58,14 +58,14 @@ class KnownKeys:
             self._names = known_keys(keys_root())
         except Exception as error:  # noqa: BLE001 - whatever is wrong with them must not end the server
             failure = (
-                f"the known keys cannot be read, and the previous ones stay valid: {format_error(error)}"
+                f"the known keys cannot be read, so the previous keys stay valid: {format_error(error)}"
             )
         if failure and failure != self._failure:
             self._report(failure)
         self._failure = failure
 
     def start(self, context: Any) -> None:
-        """Have the sockets of this context of ZeroMQ refuse clients whose keys are not known."""
+        """Make the sockets of this ZeroMQ context refuse clients whose keys are unknown."""
         if self.own is not None:
             from zmq.auth.thread import ThreadAuthenticator
 
@@ -74,11 +74,11 @@ class KnownKeys:
             self._authenticator.configure_curve_callback("labseq", credentials_provider=self)
 
     def end(self) -> None:
-        """End what :meth:`start` began."""
+        """Stop refusing clients."""
         if self._authenticator is not None:
             self._authenticator.stop()
 
     def callback(self, domain: str, key: bytes) -> bool:
-        """Whether a client with this key may connect; the authenticator asks."""
+        """Whether a client with this key may connect. Called by the authenticator."""
         del domain
         return self.is_known(key.decode("ascii"))

@@ -1,7 +1,7 @@
-"""A device that is served: its socket, and the one thread in which all calls into its drivers are made.
+"""A served device, with its socket and the one thread in which all calls into its drivers are made.
 
-One client at a time, the owner, may open the device; the others may ask for what needs no open device,
-and for the description by the owner's driver. The calls of a client are made in the order of their numbers.
+One client at a time, the owner, may open the device. The others may make calls that need no open device,
+and read the description by the owner's driver. A client's calls are made in the order of their numbers.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ POLL_S: Final = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A message of a client: the call of a method.
+    """A client's message that calls a method.
 
     Attributes:
         session: Token of the client's session.
         n: Number of the call, from 1.
         call: Name of the method.
-        args: Its arguments.
-        named: Its named arguments.
+        args: Positional arguments.
+        named: Named arguments.
     """
 
     session: bytes
@@ -51,8 +51,8 @@ class RefusedError(Exception):
     """A message that is not carried out.
 
     Attributes:
-        number: Number of the call; 0 for a message that cannot be read.
-        error: Why.
+        number: Number of the call. 0 for a message that cannot be read.
+        error: Why the message is refused.
     """
 
     def __init__(self, number: int, error: LabseqError) -> None:
@@ -66,7 +66,7 @@ class ForControlError(Exception):
 
 
 def read_call(parts: list[Any]) -> Call:
-    """The call in a message.
+    """Read the call in a message.
 
     Raises:
         MessageError: The message is damaged, or is not a call.
@@ -83,22 +83,22 @@ def read_call(parts: list[Any]) -> Call:
 
 
 class ServedDevice:
-    """A device, the thread that makes all calls into its drivers, and the socket that they come from.
+    """A device, the thread that makes all calls into its drivers, and the socket that receives the calls.
 
     Attributes:
-        name: Its role, or its name in the profile.
+        name: Role of the device, or its name in the profile.
         kind: Kind of the device, "camera".
         sessions: Token -> session.
         ended: Token -> why that session ended, for the last 64.
-        is_busy: Whether its thread is doing anything but waiting for messages.
-        failure: What ended its thread, or None.
+        is_busy: Whether its thread does anything other than wait for messages.
+        failure: The error that ended its thread, or None.
 
     Args:
         entry: The device.
-        socket: A ROUTER; used in the device's thread only.
+        socket: A ROUTER, used only in the device's thread.
         control_port: The port that clients have to connect to first.
-        keys: Who may connect.
-        report: Receives what happens, for the operator.
+        keys: Keys of the clients that may connect.
+        report: Receives lines of text for the operator.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class ServedDevice:
         self._thread.start()
 
     def begin_end(self) -> None:
-        """Begin to end all sessions, the device safe and closed, and then its thread."""
+        """Begin to end all sessions, with the device safe and closed, and then its thread."""
         for session in list(self.sessions.values()):
             self.end_session(session, "the server ends")
         self._ended.set()
@@ -146,13 +146,13 @@ class ServedDevice:
         return next((s for s in sessions if s.driver is not None and s.driver.is_open), None)
 
     def end_session(self, session: Session, why: str) -> None:
-        """Ask the device's thread to end a session; the call in progress is aborted."""
+        """Ask the device's thread to end a session. The call in progress is aborted."""
         if not session.ended:
             session.ended = why
             session.abort_call()
 
     def rescue_stuck(self) -> None:
-        """Make the device safe in another thread if a call does not end after it was aborted."""
+        """Make the device safe in another thread if an aborted call does not end."""
         for session in list(self.sessions.values()):
             session.rescue_if_stuck(self._report_with_name)
 
@@ -214,7 +214,7 @@ class ServedDevice:
             self._report_with_name(f"a message could not be answered: {format_error(error)}")
 
     def _answer(self, frames: list[Any]) -> list[Any]:
-        """The reply to a message; empty for one that is not answered.
+        """The reply to a message. Empty if the message is not answered.
 
         Raises:
             RefusedError: The message is not carried out.
@@ -232,7 +232,7 @@ class ServedDevice:
         if reason := self._why_refused(session, peer, frames[0].bytes, call.n):
             raise self._refused(call.n, reason)
         session.port_peer = frames[0].bytes
-        if call.n <= session.number:  # a repetition: the method must not be called twice
+        if call.n <= session.number:  # a repeated message, for which the method must not be called again
             return session.reply if call.n == session.number else []
         session.begin_call(call.n, call.call)
         session.reply = self._reply(session, call)
@@ -240,7 +240,7 @@ class ServedDevice:
         return session.reply
 
     def _why_refused(self, session: Session, peer: str, port_peer: bytes, number: int) -> str:
-        """Why a call is not carried out; "" if it may be. Wrong calls end their session."""
+        """Why a call is not carried out, or "" if it may be. Wrong calls end their session."""
         if peer != session.peer:
             return "the connection belongs to another key"
         # frames may wait in memory for one connection only that does not read them
@@ -253,7 +253,7 @@ class ServedDevice:
         return session.ended
 
     def _wrong_port(self) -> ConfigError:
-        what = f"this is the port of a device, '{self.name}', and not of its server"
+        what = f"this is the port of the device '{self.name}', not of its server"
         return ConfigError(Problem(what, expected=f"port {self._control_port}", hint="change 'address'"))
 
     def _refused(self, number: int, text: str) -> RefusedError:
@@ -306,7 +306,7 @@ class ServedDevice:
         owner = self.owner
         if owner not in (None, session):
             assert owner is not None
-            raise DeviceError(self.name, f"in use by {owner.who}; only one client at a time can use it")
+            raise DeviceError(self.name, f"in use by {owner.who}, and only one client at a time can use it")
         if owner is None:
             self._report_with_name(f"in use by {session.who}")
         driver.open(partial(self.end_session, session))
@@ -316,7 +316,7 @@ class ServedDevice:
             raise DeviceError(self.name, "; ".join(failures))
 
     def _close(self, session: Session) -> None:
-        """End a session: its device is made safe and closed if the client has not done so."""
+        """End a session. Its device is made safe and closed if the client has not done so."""
         latest = [*self.ended.items()][-63:]
         self.ended = {**dict(latest), session.token: session.ended}
         try:
@@ -325,7 +325,7 @@ class ServedDevice:
                 failures = session.driver.close()
                 outcome = "; ".join(failures) or f"made safe in {1e3 * (time.monotonic() - start_s):.0f} ms"
                 who, why = session.who, session.ended
-                self._report_with_name(f"the connection of {who} ended ({why}); {outcome}")
+                self._report_with_name(f"the connection of {who} ended ({why}): {outcome}")
         finally:
             del self.sessions[session.token]
 

@@ -1,4 +1,4 @@
-"""`labseq serve-devices`: serves the devices of a profile, each on a port of its own."""
+"""`labseq serve-devices`: serves the devices of a profile, each on its own port."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ END_S: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """What is served, and where.
+    """The served devices and their address.
 
     Attributes:
-        address: ``tcp://HOST:PORT``: the port of the control, and the first of those of the devices.
-        devices: Roles and names of devices; none for all real ones of the profile, or all if none is real.
+        address: ``tcp://HOST:PORT`` with the control's port. The devices have the next ports.
+        devices: Roles and names of devices. None for all real devices of the profile, or all if none is real.
         plain: Whether to serve without keys, on this computer only.
     """
 
@@ -66,10 +66,10 @@ class Serving:
 def serve_devices(
     profile: str, overrides: Sequence[str], options: Serving, report: Callable[[str], object]
 ) -> None:
-    """Serve devices until Ctrl-C or SIGTERM; then they are made safe.
+    """Serve devices until Ctrl-C or SIGTERM, and then make them safe.
 
-    Each device is opened, tested, made safe and closed first: that shows that it works, and makes it safe
-    after a server that died.
+    First each device is opened, tested, made safe and closed. This shows that it works, and makes it safe
+    if an earlier server died.
 
     Raises:
         ConfigError: The profile, the address or the keys are wrong, or a device could not be constructed.
@@ -90,15 +90,15 @@ def serve_devices(
 def serving(
     profile: str, overrides: Sequence[str], options: Serving, report: Callable[[str], object]
 ) -> Generator[Server]:
-    """Context manager: serves the devices as :func:`serve_devices` does, until the end of the block."""
+    """Context manager that serves devices like :func:`serve_devices` until the end of the block."""
     try:
         host, port = parse_address(options.address)
     except ValueError as error:
         raise ConfigError(str(error)) from error
     if options.plain and not is_loopback(host):
-        hint = "'labseq keys new' makes keys; --plain is for addresses such as tcp://127.0.0.1:5760"
+        hint = "make keys with 'labseq keys new' (--plain is for addresses such as tcp://127.0.0.1:5760)"
         raise ConfigError(
-            Problem(f"{options.address} can be reached from other computers, and needs keys", hint=hint)
+            Problem(f"{options.address} can be reached from other computers, so it needs keys", hint=hint)
         )
     keys = None if options.plain else find_keys(keys_root())
     whole = resolve_profile(profile, overrides=profile_overrides(overrides))
@@ -119,7 +119,7 @@ def serving(
 
 
 def _served(hardware: ResolvedProfile, names: tuple[str, ...]) -> dict[str, ChosenPlugin]:
-    """The devices that are served: those named, else the real ones, else all."""
+    """The devices to serve, which are the named ones, else the real ones, else all."""
     devices = {name: plugin for name, plugin in hardware.chosen.items() if plugin.entry.role.is_hardware}
     for name in names:
         if name not in devices:
@@ -164,14 +164,14 @@ class Server:
     """The devices and their control.
 
     Attributes:
-        devices: The devices that are served, by name.
+        devices: The served devices, by name.
 
     Args:
         entries: The devices.
         host: Address to listen on.
-        port: The control's port; the devices have the next ones.
-        own: Keys of this computer; None without keys.
-        report: Receives what happens, for the operator.
+        port: The control's port. The devices have the next ports.
+        own: Keys of this computer. None without keys.
+        report: Receives lines of text for the operator.
     """
 
     def __init__(
@@ -186,7 +186,7 @@ class Server:
 
         self._report_to = report
         self._zmq = zmq.Context()
-        # closed at the end: files can then be opened to make devices safe, even if connections used up all
+        # closed at the end, so that files can be opened to make devices safe even if connections used up all
         self._spare = [os.open(os.devnull, os.O_RDONLY) for _ in range(32)]
         self._keys = KnownKeys(own, self._report)
         self.devices: dict[str, ServedDevice] = {}
@@ -211,7 +211,7 @@ class Server:
             device.start()
         self._control.start()
         places = ", ".join(f"{name} at {port}" for name, port in self._control.ports.items())
-        self._report(f"serves {places}; control at {self._control_address}; Ctrl-C stops it")
+        self._report(f"serves {places}, with control at {self._control_address} (Ctrl-C stops it)")
         if self._keys.own is not None:
             self._report(f"known keys: {self._keys.names}")
 
@@ -232,15 +232,15 @@ class Server:
         self._gate.end()
         self._keys.end()
         for name in late:
-            self._report(f"{name}: NOT SAFE: a call does not return")
+            self._report(f"{name}: NOT SAFE, because a call does not return")
         if not late:
             self._zmq.destroy(linger=0)
 
     def check(self) -> None:
-        """Raise what ended the thread of the gate, of the control, or of a device.
+        """Raise the error that ended the thread of the gate, the control or a device.
 
         Raises:
-            DeviceError: It has ended.
+            DeviceError: A thread has ended.
         """
         for failure in (
             self._gate.failure,

@@ -1,4 +1,4 @@
-"""A client's session with a served device, and the call that is carried out for it."""
+"""A client's session with a served device, and the call in progress."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from labseq.guard import StopFlag
 from labseq.remote.drivers import ClientDriver
 
 GRACE_S: Final = 0.3
-"""Longest time for an aborted call to end, in seconds; then another thread makes the device safe."""
+"""Longest time for an aborted call to end, in seconds. Then another thread makes the device safe."""
 
 CLOSED: Final = "closed"
 """Why a session has ended, if the client ended it."""
 
 
 FAULTY_S: Final = 0.1
-"""Time of a thread that the wrong messages of a client may take at once, in seconds."""
+"""Thread time that the wrong messages of a client may take at once, in seconds."""
 FAULTY_SHARE: Final = 0.01
-"""The share of its time that they may take after that."""
+"""The share of the thread's time that they may take after that."""
 
 
 class Faults:
-    """The time that wrong messages have taken, client by client; used in one thread.
+    """The time taken by wrong messages, per client. Used in one thread.
 
     A client that takes too much is not read until its share has grown again, so that others need not wait.
     """
 
     def __init__(self) -> None:
-        self._left: dict[object, tuple[float, float]] = {}  # client -> time left, and when that was
+        self._left: dict[object, tuple[float, float]] = {}  # client -> time left, and when it was computed
 
     def are_too_many(self, client: object) -> bool:
-        """Whether the messages of a client are to be thrown away unread."""
+        """Whether to throw away the messages of a client unread."""
         return client in self._left and self._left_s(client) <= 0.0
 
     def count(self, client: object, took_s: float) -> None:
@@ -52,10 +52,10 @@ class Faults:
 
 
 class Abort(StopFlag):
-    """The request to end the call in progress; the next call begins without it."""
+    """The request to end the call in progress. The next call begins without it."""
 
     def clear(self) -> None:
-        """Take the request back."""
+        """Withdraw the request."""
         self._event.clear()
 
 
@@ -64,19 +64,19 @@ class Session:
     """A client's connection to a device. The control's thread sees and aborts its calls.
 
     Attributes:
-        peer: The client's public key; "" without keys.
-        who: What the client calls itself, for other users.
-        connection: The connection that its heartbeats come from; see :class:`labseq.wire.Connections`.
+        peer: The client's public key, or "" without keys.
+        who: Name that the client gave itself, for other users.
+        connection: The connection of its heartbeats, see :class:`labseq.wire.Connections`.
         token: Names the session in each message.
         port_peer: ZeroMQ's name of the connection to the device's port; empty before the first call.
         beat_s: Time of its last heartbeat.
-        ended: Why it has ended; "" while it has not.
-        driver: Its own object of the driver; None before the client has sent its context.
+        ended: Why it has ended, or "" before.
+        driver: The session's driver object. None before the client has sent its context.
         number: Number of the last call.
         call: Name of the last call.
-        reply: The parts of the last reply, in case the message comes twice.
-        began_s: When the call in progress began; None while none is.
-        rescue: Outcome of making the device safe during that call: "" if it was not necessary, "under way",
+        reply: The parts of the last reply, in case its message comes again.
+        began_s: Start of the call in progress, or None.
+        rescue: Outcome of making the device safe during that call. "" if it was not necessary, "under way",
             "safe", or why it failed.
     """
 
@@ -105,7 +105,7 @@ class Session:
         self._aborted_s, self.rescue, self.began_s = None, "", time.monotonic()
 
     def end_call(self) -> None:
-        """Record the end of a call; if another thread is making the device safe, wait for that first.
+        """Record the end of a call. If another thread is making the device safe, wait for that first.
 
         A driver need not accept other calls while ``safe_state()`` runs.
         """
@@ -122,7 +122,7 @@ class Session:
             self.abort.request()
 
     def rescue_if_stuck(self, report: Callable[[str], object]) -> None:
-        """Make the device safe in another thread if a call does not end after it was aborted."""
+        """Make the device safe in another thread if an aborted call does not end."""
         with self._deciding:
             is_stuck = self._aborted_s is not None and time.monotonic() > self._aborted_s + GRACE_S
             if self.began_s is None or not is_stuck or self.rescue or self.driver is None:
@@ -133,5 +133,5 @@ class Session:
 
     def _rescue(self, driver: ClientDriver, report: Callable[[str], object]) -> None:
         self.rescue = driver.make_safe_during_call() or "safe"
-        report(f"{self.call}() does not return; made safe from another thread: {self.rescue}")
+        report(f"{self.call}() does not return, so it was made safe from another thread: {self.rescue}")
         self._is_rescued.set()

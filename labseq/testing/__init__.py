@@ -1,4 +1,4 @@
-"""For plugin authors: contract suites, hypothesis strategies, fakes.
+"""Contract suites, hypothesis strategies and fakes for authors of plugins.
 
 A plugin's test inherits the suite of its role and provides one fixture::
 
@@ -11,12 +11,12 @@ A plugin's test inherits the suite of its role and provides one fixture::
         def factory(self):
             return partial(MyCamera, MySettings(port="simulated"))
 
-``factory(context)`` constructs the plugin, as labseq does after it has read the
-settings. Each failure names the promise that was broken.
+``factory(context)`` constructs the plugin like labseq, after the
+settings were read. Each failure names the broken promise.
 
-``SUITES`` has the suite of each kind of plugin; ``docs/reference/testing.md`` lists all promises.
+``SUITES`` has the suite of each kind of plugin, and ``docs/reference/testing.md`` lists all promises.
 
-Never imported at run time: needs pytest and hypothesis (``pip install "labseq[testing]"``). Names are
+Runs never import it, because it needs pytest and hypothesis (``pip install "labseq[testing]"``). Names are
 resolved when they are first used, because pytest loads this package wherever labseq is installed.
 """
 

@@ -1,6 +1,6 @@
-"""Fixtures for tests of plugins; pytest finds them automatically.
+"""Fixtures for tests of plugins. pytest finds them automatically.
 
-Loaded into every pytest of the environment, so labseq is imported only inside
+Every pytest of the environment loads this module, so labseq is imported only inside
 the fixtures.
 """
 
@@ -43,7 +43,7 @@ def paper_grid() -> SiteGrid:
 
 @pytest.fixture
 def virtual_clock() -> FakeClock:
-    """A clock whose time passes only during waits; it records every wait."""
+    """A clock whose time passes only during waits. It records every wait."""
     from labseq.testing.fakes import FakeClock
 
     return FakeClock()
@@ -51,7 +51,7 @@ def virtual_clock() -> FakeClock:
 
 @pytest.fixture
 def labseq_context(paper_grid: SiteGrid, virtual_clock: FakeClock) -> Context:
-    """A context for a plugin's factory: the paper's grid, virtual time, a recording simulation."""
+    """A context for a plugin's factory, with the paper's grid, virtual time and a recording simulation."""
     from labseq.roles import Context
     from labseq.testing.fakes import Calls, RecordingSimulation
 

@@ -1,4 +1,4 @@
-"""hypothesis strategies for what labseq works with: arrays, targets, grids, plans, tone programs."""
+"""hypothesis strategies for arrays, targets, grids, plans and tone programs."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Shape: TypeAlias = tuple[int, int]
 
 
 def shapes(max_shape: Shape = (6, 6)) -> SearchStrategy[Shape]:
-    """(n_rows, n_cols) from (1, 1) to ``max_shape``; single lines and sites come often."""
+    """Shapes (n_rows, n_cols) from (1, 1) to ``max_shape``, often single lines and sites."""
     return st.tuples(st.integers(1, max_shape[0]), st.integers(1, max_shape[1]))
 
 
 def occupancies(shape: Shape | None = None, *, max_shape: Shape = (6, 6)) -> SearchStrategy[Occupancy]:
-    """Any loading, including the empty and the full one; bool (n_rows, n_cols).
+    """Any loading, including the empty and the full one, bool (n_rows, n_cols).
 
     Args:
         shape: The wanted shape, or None for any up to ``max_shape``.
@@ -34,7 +34,7 @@ def occupancies(shape: Shape | None = None, *, max_shape: Shape = (6, 6)) -> Sea
 
 
 def masks(shape: Shape) -> SearchStrategy[NDArray[np.bool_]]:
-    """Masks of a given shape, bool; drawn as the bits of one number, which is quick and shrinks well."""
+    """Masks of a given shape, bool. Drawn as the bits of one number, which is quick and shrinks well."""
     n_sites = shape[0] * shape[1]
 
     def of_bits(bits: int) -> NDArray[np.bool_]:
@@ -45,7 +45,7 @@ def masks(shape: Shape) -> SearchStrategy[NDArray[np.bool_]]:
 
 
 def targets(shape: Shape | None = None, *, max_shape: Shape = (6, 6)) -> SearchStrategy[TargetPattern]:
-    """Targets that want any site filled, cleared or neither; those without atoms too.
+    """Targets with any sites to be filled, cleared or neither, including targets without atoms.
 
     Args:
         shape: The grid's (n_rows, n_cols), or None for any up to ``max_shape``.
@@ -75,16 +75,16 @@ def grids(draw: DrawFn, max_shape: Shape = (6, 6)) -> SiteGrid:
 
 @st.composite
 def plans(draw: DrawFn, occupancy: Occupancy, *, max_batches: int = 4, max_tweezers: int = 20) -> Plan:
-    """Legal plans for an occupancy: batches along one line each, without ejection or links.
+    """Legal plans for an occupancy, with batches along one line each and without ejection or links.
 
-    In each batch some atoms of a line stand, and those between two of them move to
+    In each batch some atoms of a line stay, and the atoms between two of them move to
     other sites there, in their order.
 
     Args:
         draw: Given by hypothesis.
-        occupancy: bool (n_rows, n_cols), what the plan starts with.
-        max_batches: Most batches.
-        max_tweezers: Most atoms that move in a batch.
+        occupancy: bool (n_rows, n_cols), at the start of the plan.
+        max_batches: Maximum number of batches.
+        max_tweezers: Maximum number of atoms that move in a batch.
     """
     atoms = np.array(occupancy, np.bool_)
     batches: list[Batch] = []
@@ -106,7 +106,7 @@ def plans(draw: DrawFn, occupancy: Occupancy, *, max_batches: int = 4, max_tweez
 
 @st.composite
 def _line_moves(draw: DrawFn, atoms: list[int], n_sites: int, max_moves: int) -> list[tuple[int, int]]:
-    """(from, to) along one line of ``n_sites``, of some of the atoms on it."""
+    """Moves (from, to) of some of the atoms along one line of ``n_sites``."""
     moving = draw(st.lists(st.sampled_from(atoms), unique=True, max_size=max_moves)) if atoms else []
     standing = [-1, *(atom for atom in atoms if atom not in moving), n_sites]
     moves: list[tuple[int, int]] = []
@@ -132,12 +132,12 @@ def tone_programs(
     motion: MotionSpec | None = None,
     max_shape: Shape = (6, 6),
 ) -> ToneProgram:
-    """Tone programs of small legal plans, those without segments too.
+    """Tone programs of small legal plans, including programs without segments.
 
     Args:
         draw: Given by hypothesis.
-        grid: The grid; any up to ``max_shape`` by default.
-        motion: How the mobile tweezers move; the paper's by default.
+        grid: The grid. Default any up to ``max_shape``.
+        motion: Motion of the mobile tweezers. Default the paper's.
         max_shape: The largest grid.
     """
     from labseq.motion import tone_program

@@ -194,7 +194,7 @@ def test_a_planner_that_cannot_be_warmed_is_named() -> None:
                 "dop": "6",
                 "overrides": [f"profile.mobile_tweezers.max_{a}_tones=5" for a in ("row", "column")],
             },
-            "--dop 6: .*; expected 1 to 5, the most tones of an axis",
+            "--dop 6: .*; expected 1 to 5, the maximum number of tones per axis",
         ),
         ({"dop": "7,x"}, "--dop 7,x: this is not a degree of parallelism; expected whole numbers"),
         ({"planners": "psca:dop=3"}, "psca:dop=3: 'dop' is not a setting of planner 'psca'"),

@@ -241,7 +241,7 @@ class TestEarlierResults:
         [
             (lambda content: content["measured"]["fine"].update(took_s=0.1), "edited"),
             (lambda content: sealed(content, "computer", machine_id="another", node="pc2"), "'pc2'"),
-            (lambda content: sealed(content, "card", firmware="1"), "firmware 1, and the device has 2"),
+            (lambda content: sealed(content, "card", firmware="1"), "firmware 1, but the device has 2"),
         ],
         ids=["edited", "of another computer", "of older firmware"],
     )

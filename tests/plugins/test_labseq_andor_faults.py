@@ -128,7 +128,7 @@ def test_frames_overwritten_in_the_ring_buffer() -> None:
         for _ in range(5):
             lab.sim.trigger()
             lab.clock.sleep(0.05)
-        with pytest.raises(TransientError, match="frames 0 to 1 were lost, of a series of 6"):
+        with pytest.raises(TransientError, match="frames 0 to 1 were lost from a series of 6"):
             lab.camera.read(1.0)
         assert [lab.camera.read(1.0).number for _ in range(3)] == [2, 3, 4]
         lab.sim.trigger()

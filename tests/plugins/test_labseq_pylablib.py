@@ -139,7 +139,7 @@ def test_a_frame_that_is_lost_on_its_way_leaves_a_gap_of_the_numbers() -> None:
             lab.clock.sleep(0.05)
         lab.dcam.faults.lost_frames = 0
         assert lab.camera.read(1.0).number == 0
-        with pytest.raises(TransientError, match="frames 1 to 2 were lost, of a series of 4"):
+        with pytest.raises(TransientError, match="frames 1 to 2 were lost from a series of 4"):
             lab.camera.read(1.0)
         assert lab.camera.read(1.0).number == 3
 

@@ -97,7 +97,7 @@ def test_simulated_failures_come_with_their_probability() -> None:
         try:
             flaky.camera.read(1.0)
         except TransientError as error:
-            assert str(error).startswith("camera: frame 0 was lost, of a series of 1")
+            assert str(error).startswith("camera: frame 0 was lost from a series of 1")
             n_lost += 1
     assert 12 < n_lost < 48
 

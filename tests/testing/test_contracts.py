@@ -65,8 +65,8 @@ FAULTS = [
 ADVICE = {
     "ReturnsBatches": "a list\nto do: 'return Plan.from_batches(batches)'",
     "TakesTheOccupancyAlone": "'def plan(self, occupancy, target)'",
-    "Prints": "it printed 'planning\\n'; use logging.getLogger(__name__)",
-    "CountsFromOne": "takes an atom from (1, 1); there is none for the loading\n#\n",
+    "Prints": "it printed 'planning\\n' (use logging.getLogger(__name__))",
+    "CountsFromOne": "takes an atom from (1, 1), which is empty, for the loading\n#\n",
     "ChecksNothing": "begin plan() with 'occupancy = as_occupancy(",
     "Sleeps": "called time.sleep(1e-09)\nto do: wait with context.clock",
     "WaitsInRealTime": "during work that takes 0.0099 s\nto do: wait with context.clock",

@@ -1,4 +1,4 @@
-"""One suite of tests per kind of plugin; a plugin's test class inherits the suite of its kind."""
+"""One suite of tests per kind of plugin. A plugin's test class inherits the suite of its kind."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -27,7 +27,7 @@ SUITES: Final[Mapping[str, type[Any]]] = {
     "scanner": ScannerContract,
     "analysis": AnalysisContract,
 }
-"""Kind of plugin, as the registry knows it -> its suite."""
+"""Kind of plugin, as in the registry -> its suite."""
 
 __all__ = [
     "SUITES",

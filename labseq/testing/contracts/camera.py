@@ -38,15 +38,15 @@ class CameraContract(HardwareContract[Camera]):
     bases: ClassVar[tuple[str, ...]] = (WORKS, ALWAYS_SAFE, NUMBERED)
     role: ClassVar[str] = "camera"
     how_it_works: ClassVar[str] = (
-        "after arm(n) each trigger() exposes a frame, which read() returns; _take of a CameraDriver returns "
-        "ExposureResult(number, image): numbers from 0 in each series, the image uint16 (height, width)"
+        "after arm(n) each trigger() exposes a frame, which read() returns. _take of a CameraDriver returns "
+        "ExposureResult(number, image), numbers from 0 in each series and the image uint16 (height, width)"
     )
     exposure_s: ClassVar[float] = 0.01
     exposure_tolerance: ClassVar[float] = 0.01
     timeout_s: ClassVar[float] = 2.0
 
     def work(self, device: Camera) -> None:
-        """One image."""
+        """Take one image."""
         self.take(device)
 
     def work_time_s(self) -> float:
@@ -79,7 +79,7 @@ class CameraContract(HardwareContract[Camera]):
         }
 
     def excesses(self) -> Mapping[str, Action[Camera]]:
-        """Series and exposures that no camera can make."""
+        """Series and exposures that are impossible for any camera."""
 
         def arm(n_frames: int, exposure_s: float) -> Action[Camera]:
             return lambda camera: camera.arm(n_frames, exposure_s, "software")
@@ -93,7 +93,7 @@ class CameraContract(HardwareContract[Camera]):
         }
 
     def waits(self) -> Mapping[str, Wait[Camera]]:
-        """For a frame without a software trigger, and without an external one."""
+        """Waits for a frame without a software trigger, and without an external trigger."""
 
         def arm(trigger: Trigger) -> Action[Camera]:
             def enter(camera: Camera) -> None:
@@ -151,7 +151,7 @@ class CameraContract(HardwareContract[Camera]):
         "subtract the library's number of the first frame of the series",
     )
     def test_numbers_its_frames(self, factory: Factory[Camera]) -> None:
-        """A gap shows that a frame was lost; time stamps are the camera's own, and optional."""
+        """A gap shows that a frame was lost. Time stamps are the camera's own, and optional."""
         with self.opened(factory) as (camera, _):
             for _ in range(2):
                 frames = [frame for frame in self.take(camera, 3) if isinstance(frame, Frame)]
@@ -175,7 +175,7 @@ class CameraContract(HardwareContract[Camera]):
 
     @promise("with the internal trigger the frames of a series come without trigger()")
     def test_exposes_by_itself(self, factory: Factory[Camera]) -> None:
-        """For a camera that has it."""
+        """For a camera with the internal trigger."""
         with self.opened(factory) as (camera, _):
             if "internal" not in camera.facts.triggers:
                 return
@@ -210,7 +210,7 @@ class CameraContract(HardwareContract[Camera]):
 
     @promise("a frame does not change after it was read", "return a copy of the library's buffer")
     def test_frames_do_not_change(self, factory: Factory[Camera]) -> None:
-        """A driver that returns its own buffer would overwrite the last image with the next."""
+        """Otherwise the next image overwrites the last one in the driver's buffer."""
         with self.opened(factory) as (camera, _):
             frame = self.take(camera)[0]
             before = np.array(frame.image)

@@ -1,4 +1,4 @@
-"""What detectors, scanners and analyses promise: pure functions of frames, results and shots."""
+"""Promises of detectors, scanners and analyses, which are pure functions of frames, results and shots."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ DetectorFactory: TypeAlias = Callable[[Context], Detector]
 
 
 class DetectorContract:
-    """Promises of a detector; provide the fixture ``factory``.
+    """Promises of a detector. Provide the fixture ``factory``.
 
     Attributes:
-        frame_shape: (height, width) of the frames that it takes.
+        frame_shape: (height, width) of the frames that the detector takes.
     """
 
     frame_shape: ClassVar[tuple[int, int]] = (512, 512)
 
     @pytest.fixture
     def factory(self) -> DetectorFactory:
-        """Constructs the detector, given a context; provided by the plugin's test."""
+        """Constructs the detector from a context. Provided by the plugin's test."""
         no_factory(self, "context -> detector")
 
     def context(self) -> Context:
-        """What the detector is constructed with; override it for another grid."""
+        """Context of the detector. Override it for another grid."""
         return Context("detector", SiteGrid())
 
     def frames(self) -> dict[str, Frame]:
-        """Frames of the right size: description -> frame."""
+        """Frames of the right size, as description -> frame."""
         noise = np.random.default_rng(7).integers(0, 2000, self.frame_shape, np.uint16)
         return {
             "a noisy frame": _frame_of(noise),
@@ -83,7 +83,7 @@ class DetectorContract:
 
     @promise("the same frame gives the same answer")
     def test_same_frame_same_answer(self, factory: DetectorFactory) -> None:
-        """A second time, after other frames, and from a new instance."""
+        """Again, after other frames, and from a new instance."""
         detector = factory(self.context())
 
         def answer_of(any_detector: Detector) -> Detection:
@@ -94,14 +94,14 @@ class DetectorContract:
         for other in self.frames().values():
             detector.detect(other)
         again["after other frames"] = answer_of(detector)
-        again["from a fresh instance"] = answer_of(factory(self.context()))
+        again["from a new instance"] = answer_of(factory(self.context()))
         for when, answer in again.items():
             for name, was, now in zip(("occupancy", "confidence", "signals"), first, answer, strict=False):
                 assert np.array_equal(was, now), f"the {name} is another {when}"
 
     @promise("an answer does not change after it was given")
     def test_answers_do_not_change(self, factory: DetectorFactory) -> None:
-        """A detector that returns its own buffers would overwrite the last answer with the next."""
+        """Otherwise the next answer overwrites the last one in the detector's buffers."""
         detector = factory(self.context())
         frames = self.frames()
         answer = detector.detect(frames["a noisy frame"])
@@ -113,7 +113,7 @@ class DetectorContract:
 
     @promise("the frame is left untouched")
     def test_leaves_the_frame_untouched(self, factory: DetectorFactory) -> None:
-        """It is written to disk afterwards."""
+        """The frame is written to disk afterwards."""
         detector = factory(self.context())
         frame = self.frames()["a noisy frame"]
         before = np.array(frame.image)
@@ -132,7 +132,7 @@ class DetectorContract:
 
     @promise("detect() is pure: no I/O, no change of shared state")
     def test_does_no_io(self, factory: DetectorFactory) -> None:
-        """It runs between the exposure and the moves."""
+        """The detector runs between the exposure and the moves."""
         detector = factory(self.context())
         frame = self.frames()["a noisy frame"]
         with doing("the first detect()"):
@@ -159,10 +159,10 @@ GIVES_POINTS: Final = "next_point() soon gives an allowed value for each address
 
 
 class ScannerContract:
-    """Promises of a scanner; provide the fixture ``factory``.
+    """Promises of a scanner. Provide the fixture ``factory``.
 
     Attributes:
-        n_points: Points that it is asked for in each test.
+        n_points: Number of points in each test.
         time_limit_s: Longest time for one point, in seconds.
     """
 
@@ -171,11 +171,11 @@ class ScannerContract:
 
     @pytest.fixture
     def factory(self) -> ScannerFactory:
-        """Constructs the scanner, given a space; provided by the plugin's test."""
+        """Constructs the scanner from a space. Provided by the plugin's test."""
         no_factory(self, "space -> scanner")
 
     def spaces(self) -> dict[str, ScanSpace]:
-        """The spaces to choose from: description -> space."""
+        """The spaces to choose from, as description -> space."""
         dop = ScanRange("planner.degree_of_parallelism", 2, 15, is_whole=True, start=7)
         ramp = ScanRange("profile.mobile_tweezers.pick_up", 20e-6, 400e-6)
         speed = ScanRange("profile.mobile_tweezers.speed", 0.05, 0.2, n_steps=10, start=0.13)
@@ -185,7 +185,7 @@ class ScannerContract:
 
     @promise(GIVES_POINTS)
     def test_points_are_in_their_ranges(self, factory: ScannerFactory) -> None:
-        """With scores that rise, stay the same, or are missing."""
+        """With scores that rise, stay the same or are missing."""
         for what, space in self.spaces().items():
             for kind, scores in _SCORES.items():
                 with doing(f"on {what}, {kind}"):
@@ -193,7 +193,7 @@ class ScannerContract:
 
     @promise("the same space and the same results give the same point")
     def test_same_results_same_point(self, factory: ScannerFactory) -> None:
-        """A second time, and from a new instance that receives all results at once, as in a resumed run."""
+        """Again, and from a new instance that receives all results at once, as in a resumed run."""
         for what, space in self.spaces().items():
             scanner = factory(space)
             visited = self.visited(scanner, space, _hill)
@@ -201,11 +201,11 @@ class ScannerContract:
                 results = _copies(visited[:n])
                 answers = [_plain(each.next_point(_copies(results))) for each in (scanner, factory(space))]
                 earlier = _plain(visited[n].values) if n < len(visited) else answers[0]
-                assert answers == [earlier] * 2, f"on {what}, point {n} was {earlier}, and is {answers}"
+                assert answers == [earlier] * 2, f"on {what}, point {n} was {earlier}, and now is {answers}"
 
     @promise("the input is left untouched")
     def test_leaves_its_input_untouched(self, factory: ScannerFactory) -> None:
-        """Other code has the same points."""
+        """Other code uses the same points."""
         space = self.spaces()["all kinds of range"]
         scanner = factory(space)
         visited = self.visited(scanner, space, _hill)
@@ -222,7 +222,7 @@ class ScannerContract:
             factory(space).next_point(visited)
 
     def visited(self, scanner: Scanner, space: ScanSpace, scores: Scores) -> list[VisitedPoint]:
-        """The points that it chooses one after another, ``n_points`` at most, each checked."""
+        """The points that the scanner chooses in turn, ``n_points`` at most, each checked."""
         visited: list[VisitedPoint] = []
         with promised(GIVES_POINTS):
             while len(visited) < self.n_points:
@@ -237,7 +237,7 @@ class ScannerContract:
 
 
 def _check_point(point: Any, space: ScanSpace) -> None:
-    """Fail for anything but a point of the space."""
+    """Fail unless the point is in the space."""
     assert isinstance(point, Mapping), f"next_point() gave a {type(point).__name__}"
     values = cast("Mapping[str, Any]", point)
     expected = {axis.address for axis in space.ranges}
@@ -283,19 +283,19 @@ GIVES_RESULTS: Final = "shot() gives names and numbers, texts, arrays, or lists 
 
 
 class AnalysisContract:
-    """Promises of an analysis; provide the fixture ``factory``."""
+    """Promises of an analysis. Provide the fixture ``factory``."""
 
     @pytest.fixture
     def factory(self) -> AnalysisFactory:
-        """Constructs the analysis, given a context; provided by the plugin's test."""
+        """Constructs the analysis from a context. Provided by the plugin's test."""
         no_factory(self, "context -> analysis")
 
     def context(self) -> Context:
-        """What the analysis is constructed with; override it for another grid or calibrations."""
+        """Context of the analysis. Override it for another grid or calibrations."""
         return Context("analysis", SiteGrid(6, 7))
 
     def shots(self) -> Mapping[str, FakeShot]:
-        """Shots that it can analyse: description -> shot; override it for what it needs of them."""
+        """Valid shots, as description -> shot. Override it if the analysis needs other shots."""
         shape = self.context().grid.shape
         return {
             "a shot of two images": fake_shot(shape, n_images=2),
@@ -303,7 +303,7 @@ class AnalysisContract:
         }
 
     def odd_shots(self) -> Mapping[str, FakeShot]:
-        """Incomplete shots: description -> shot."""
+        """Incomplete shots, as description -> shot."""
         shape = self.context().grid.shape
         return {
             "a shot without images": fake_shot(shape, n_images=0),
@@ -330,11 +330,11 @@ class AnalysisContract:
                 f"{what} gives a different result the second time"
             )
             fresh = _result_of(factory(self.context()), shot)
-            assert dumps(fresh) == first[what], f"{what} gives a different result from a fresh instance"
+            assert dumps(fresh) == first[what], f"{what} gives a different result from a new instance"
 
     @promise("the shot is left untouched")
     def test_leaves_the_shot_untouched(self, factory: AnalysisFactory) -> None:
-        """Other analyses, and the shot's file, have the same arrays."""
+        """Other analyses and the shot's file use the same arrays."""
         analysis = factory(self.context())
         for what, shot in self.shots().items():
             before = copy.deepcopy(_arrays(shot))
@@ -357,7 +357,7 @@ class AnalysisContract:
 
     @promise("shot() is pure: no I/O, no change of shared state")
     def test_is_pure(self, factory: AnalysisFactory) -> None:
-        """The results are kept by labseq."""
+        """labseq stores the results."""
         analysis = factory(self.context())
         for shot in self.shots().values():
             _result_of(analysis, shot)  # the first call may compile
@@ -373,7 +373,7 @@ def _result_of(analysis: Analysis, shot: RecordedShot) -> Any:
 
 
 def _check_value(value: Any, what: str) -> None:
-    """Fail for values that a line of results could only hold as their ``repr``."""
+    """Fail for values that a line of results could only contain as their ``repr``."""
     if isinstance(value, Mapping):
         for name, one in cast("Mapping[Any, Any]", value).items():
             assert isinstance(name, str), f"{what} has the name {name!r}; expected text"

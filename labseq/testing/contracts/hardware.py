@@ -39,8 +39,8 @@ class Wait(Generic[D]):
 
     Attributes:
         timeout_s: The timeout, in seconds.
-        enter: Brings an open device into the state in which it waits.
-        wait: The call, with that timeout.
+        enter: Brings an open device into the state for the wait.
+        wait: The call with that timeout.
     """
 
     timeout_s: float
@@ -50,10 +50,10 @@ class Wait(Generic[D]):
 
 WORKS: Final = "factory(context) makes the device, and it can be opened, used as in a shot, and closed"
 _HANGING: Final[set[type]] = set()
-"""Classes of devices that hang at their work, so that each is waited for only once."""
+"""Classes of devices that hang at their work, so that the suite waits for each only once."""
 USE_THE_CLOCK: Final = (
     "wait with context.clock (self._clock of a CameraDriver): first context.clock.sleep until the result is "
-    "due, then labseq.plugin.wait_for if the device may be late; in tests and rehearsals the clock is "
+    "due, then labseq.plugin.wait_for if the device may be late. In tests and rehearsals the clock is "
     "virtual, and time.sleep or a blocking read of a library does not move it"
 )
 ALWAYS_SAFE: Final = "safe_state() is legal in every state, and twice"
@@ -62,12 +62,12 @@ ALWAYS_SAFE: Final = "safe_state() is legal in every state, and twice"
 class HardwareContract(Generic[D]):
     """Promises of every camera, tweezer driver and instrument.
 
-    Inherit the suite of the role, not this one, and provide the fixture ``factory``. A role says what its
-    calls, states and waits are.
+    Inherit the suite of the role, not this one, and provide the fixture ``factory``. A role defines its
+    calls, states and waits.
 
     Attributes:
         role: Name that the device has in the profile.
-        how_it_works: What its methods must do, for the message of a device that fails at its work.
+        how_it_works: What its methods must do, for the message when a device fails at its work.
         max_wait_s: Real time after which a call counts as hung, in seconds.
     """
 
@@ -78,11 +78,11 @@ class HardwareContract(Generic[D]):
 
     @pytest.fixture
     def factory(self) -> Factory[D]:
-        """Constructs the device, given a context; provided by the plugin's test."""
+        """Constructs the device from a context. Provided by the plugin's test."""
         no_factory(self, "context -> device")
 
     def context(self) -> Context:
-        """The context that the device is constructed with; override it for another grid or simulation.
+        """Context of the device. Override it for another grid or simulation.
 
         Keep the clock virtual, so that waiting for a timeout costs no time.
         """
@@ -90,29 +90,29 @@ class HardwareContract(Generic[D]):
         return Context(self.role, SiteGrid(), clock=clock, simulation=RecordingSimulation(Calls(clock)))
 
     def work(self, device: D) -> None:
-        """Do once what the role does in a shot; the device is open."""
+        """Do the role's work in a shot once, with an open device."""
 
     def work_time_s(self) -> float:
-        """Time that the work takes at least on the context's clock, in seconds."""
+        """Minimum time of the work on the context's clock, in seconds."""
         return 0.0
 
     def ready(self, device: D) -> None:
-        """Do what is needed before any work; the device is open."""
+        """Do whatever the work requires first, with an open device."""
 
     def uses(self) -> Mapping[str, Action[D]]:
-        """Calls of the role that need an open device: description -> call."""
+        """Calls of the role that need an open device, as description -> call."""
         return {}
 
     def states(self) -> Mapping[str, Action[D]]:
-        """States of an open device: description -> how to get there."""
+        """States of an open device, as description -> function that brings it there."""
         return {}
 
     def excesses(self) -> Mapping[str, Action[D]]:
-        """Calls that ask for more than any device can do: description -> call."""
+        """Calls beyond the limits of any device, as description -> call."""
         return {}
 
     def waits(self) -> Mapping[str, Wait[D]]:
-        """Waits that must time out: description -> wait."""
+        """Waits that must time out, as description -> wait."""
         return {}
 
     @contextmanager
@@ -122,7 +122,7 @@ class HardwareContract(Generic[D]):
         """A new device, opened, that a line triggers in steps of a kind.
 
         Returns:
-            The device, None if it refuses the line; its context; and what makes a pulse of the line,
+            The device (None if it refuses the line), its context, and a function that pulses the line,
             given its width in seconds.
         """
         context = self.context()
@@ -142,7 +142,7 @@ class HardwareContract(Generic[D]):
 
     @contextmanager
     def made(self, factory: Factory[D], context: Context | None = None) -> Generator[tuple[D, Context]]:
-        """A new device, not opened, with its context; closed at the end in any case."""
+        """A new device, not opened, with its context. Always closed at the end."""
         context = self.context() if context is None else context
         device = factory(context)
         try:
@@ -152,7 +152,7 @@ class HardwareContract(Generic[D]):
 
     @contextmanager
     def opened(self, factory: Factory[D], context: Context | None = None) -> Generator[tuple[D, Context]]:
-        """A new device, opened, with its context; closed at the end."""
+        """A new device, opened, with its context. Closed at the end."""
         with self.made(factory, context) as (device, context):
             if type(device) in _HANGING:
                 pytest.skip(f"cannot continue: promise: {WORKS}")
@@ -164,9 +164,9 @@ class HardwareContract(Generic[D]):
 
     @contextmanager
     def each_state(self, factory: Factory[D]) -> Generator[Iterator[tuple[str, D, Context]]]:
-        """A device in each of its states: (state, device, context).
+        """A device in each of its states, as (state, device, context).
 
-        The same device goes from state to state; a new one is made if it cannot.
+        The same device goes from state to state. If it cannot, a new device is made.
         """
         with ExitStack() as stack:
 
@@ -194,7 +194,7 @@ class HardwareContract(Generic[D]):
             yield {what: waiting(wait)}
 
     def call_in_time(self, context: Context, what: str, call: Callable[..., object], *args: object) -> None:
-        """Make a call that must return; one that polls the clock for ever is ended through the clock."""
+        """Make a call that must return. If it polls the clock for ever, the clock ends it."""
         try:
             in_time(self.max_wait_s, what, call, *args)
         except CallHungError:
@@ -300,7 +300,7 @@ class HardwareContract(Generic[D]):
 
     @promise(
         "describe() gives values that JSON can hold",
-        "give a dict of text, bool, int, float, None and lists of them; float(...) of numbers of numpy",
+        "give a dict of text, bool, int, float, None and lists of them, with float(...) for numbers of numpy",
     )
     def test_describes_itself(self, factory: Factory[D]) -> None:
         """It is written into every run."""
@@ -371,7 +371,7 @@ class HardwareContract(Generic[D]):
                     self._named(context, what, fail, device)
 
     def _named(self, context: Context, what: str, fail: Action[D], device: D) -> None:
-        """Check whom the error of a call names, if it is a DeviceError; then the device is made safe."""
+        """Check the device named in a call's DeviceError, if it raises one. Then make the device safe."""
         named = context.name
         try:
             self.call_in_time(context, what, fail, device)
@@ -379,9 +379,9 @@ class HardwareContract(Generic[D]):
             named = error.device
         except Exception:  # noqa: BLE001, S110 - that it fails rightly has tests of its own
             pass
-        text = f"{what} raised an error of '{named}'; the profile calls it '{context.name}'"
+        text = f"{what} raised an error of '{named}', but the profile calls it '{context.name}'"
         assert named == context.name, text
-        with suppress(Exception):  # and so has this
+        with suppress(Exception):  # as has safe_state()
             device.safe_state()
 
 
@@ -392,13 +392,13 @@ def _safe_twice(device: Hardware, state: str) -> None:
 
 
 def close_quietly(device: Hardware) -> None:
-    """Close a device and ignore errors; the promises of close() have their own tests."""
+    """Close a device and ignore errors. The promises of close() have their own tests."""
     with suppress(Exception):
         device.close()
 
 
 def _stay(device: object) -> None:
-    """Do nothing: the device has been opened already."""
+    """Do nothing, because the device is already open."""
     del device
 
 
@@ -409,6 +409,6 @@ def begin_shot(context: Context) -> None:
 
 
 def n_calls(context: Context) -> int:
-    """Number of calls of the simulation; 0 for one that does not record them."""
+    """Number of calls of the simulation, or 0 if it does not record them."""
     simulation = context.simulation
     return len(simulation.calls) if isinstance(simulation, RecordingSimulation) else 0

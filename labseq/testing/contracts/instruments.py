@@ -1,4 +1,4 @@
-"""What instruments with commands and values promise, and timing boxes that switch lines."""
+"""Promises of instruments with commands and values, and of timing boxes that switch lines."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class DeviceContract(HardwareContract[Device]):
 
     Attributes:
         commands: Every command of the device, with arguments that it accepts.
-        excessive_commands: Commands with arguments beyond a limit of the device:
+        excessive_commands: Commands with arguments beyond a limit of the device, as
             description -> (command, arguments).
-        values: Every value that it can be asked for.
+        values: Every value that can be read.
     """
 
     role: ClassVar[str] = "instrument_7"
@@ -98,8 +98,8 @@ class LinesContract(HardwareContract[Lines]):
     """Promises of a timing box.
 
     Attributes:
-        specs: The lines that are connected to it; the box must have their channels.
-        tolerance_s: How far an edge may be from its place, relative to the first one, in seconds.
+        specs: The lines connected to the box, which must have their channels.
+        tolerance_s: Largest deviation of an edge's time, relative to the first edge, in seconds.
     """
 
     role: ClassVar[str] = "lines"
@@ -115,7 +115,7 @@ class LinesContract(HardwareContract[Lines]):
         return line_program(self.specs, kind, duration_s)
 
     def ready(self, device: Lines) -> None:
-        """A program that can be fired."""
+        """Compile and arm a program, so that it can be fired."""
         device.compile(self.program())
 
     def work(self, device: Lines) -> None:
@@ -148,7 +148,7 @@ class LinesContract(HardwareContract[Lines]):
         return {"with a program": self.ready, "while armed": arm, "while a program runs": fire}
 
     def excesses(self) -> Mapping[str, Action[Lines]]:
-        """More edges, and edges closer to one another, than any box can play."""
+        """Programs with more edges, or edges closer together, than any box can play."""
 
         def check(lines: Lines) -> None:
             if overrides(lines, Lines.check_program):
@@ -163,7 +163,7 @@ class LinesContract(HardwareContract[Lines]):
         }
 
     def waits(self) -> Mapping[str, Wait[Lines]]:
-        """For the end of a long program."""
+        """Waits for the end of a long program."""
 
         def enter(lines: Lines) -> None:
             lines.compile(self.program("load", 20.0))
@@ -223,7 +223,7 @@ class LinesContract(HardwareContract[Lines]):
                 refusal(DeviceError, f"fire() after safe_state() {state}", lines.fire)
                 refusal(DeviceError, f"arm() after safe_state() {state}", lines.arm)
 
-    @promise("lines are off after open() and safe_state(), and those of `idle` on after idle()")
+    @promise("lines are off after open() and safe_state(), and the `idle` lines are on after idle()")
     def test_rests(self, factory: Factory[Lines]) -> None:
         """Tested if the context's simulation records the programs."""
         idle = line_program(self.specs, "idle", 0.0).on[-1]
@@ -252,7 +252,7 @@ class LinesContract(HardwareContract[Lines]):
 
 
 def _played(context: Context) -> Sequence[LineProgram]:
-    """The line programs that the simulation received; empty for one that does not record them."""
+    """The line programs that the simulation received. Empty if it does not record them."""
     simulation = context.simulation
     if not isinstance(simulation, RecordingSimulation):
         return []

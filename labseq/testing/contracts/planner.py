@@ -1,4 +1,4 @@
-"""What target patterns and planners promise."""
+"""Promises of target patterns and planners."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ FITS: Final = "it makes a TargetPattern of the grid's shape"
 
 
 class PatternContract:
-    """Promises of a target pattern; provide the fixture ``factory``, a function of the grid.
+    """Promises of a target pattern. Provide the fixture ``factory``, a function of the grid.
 
     Attributes:
-        grids: Grids that it fits on with the settings of the test.
-        too_small: A grid that it does not fit on; None if it fits on any.
+        grids: Grids on which the pattern fits with the settings of the test.
+        too_small: A grid on which it does not fit. None if it fits on any.
     """
 
     grids: ClassVar[Sequence[SiteGrid]] = (SiteGrid(), SiteGrid(17, 23, shear=-1))
@@ -49,7 +49,7 @@ class PatternContract:
 
     @pytest.fixture
     def factory(self) -> PatternFactory:
-        """Makes the target, given a grid; provided by the plugin's test."""
+        """Makes the target for a grid. Provided by the plugin's test."""
         no_factory(self, "grid -> target")
 
     @promise(FITS)
@@ -66,7 +66,7 @@ class PatternContract:
 
     @promise("the same grid gives the same target")
     def test_same_grid_same_target(self, factory: PatternFactory) -> None:
-        """A second time, and after other grids: a resumed run fills the same target."""
+        """Again, and after other grids, because a resumed run fills the same target."""
         first = [_target_of(factory, grid) for grid in self.grids]
         for grid, target in zip(self.grids, first, strict=True):
             again = _target_of(factory, grid)
@@ -77,13 +77,13 @@ class PatternContract:
 
     @promise("a grid that is too small for it raises LabseqError")
     def test_refuses_small_grids(self, factory: PatternFactory) -> None:
-        """``labseq check`` reports it before the run; a truncated target would be a different one."""
+        """``labseq check`` reports it before the run. A truncated target would be a different target."""
         if self.too_small is not None:
             refusal(LabseqError, _called(self.too_small), factory, self.too_small)
 
     @promise("it is pure: no I/O, no change of shared state")
     def test_is_pure(self, factory: PatternFactory) -> None:
-        """``labseq check`` makes it too; other plugins draw from the global random numbers."""
+        """``labseq check`` also makes the target, and other plugins draw from the global random numbers."""
         with doing("the first target"):
             factory(self.grids[0])  # the first call may compile
         with quietly():
@@ -110,11 +110,11 @@ Case: TypeAlias = tuple[TargetPattern, Occupancy]
 
 
 def examples(n_random: int, targets: Sequence[TargetPattern] = ()) -> list[Case]:
-    """Random cases, always the same ones and the smallest first, so that a failure is shown on a small one.
+    """Reproducible random cases, the smallest first, so that a failure is shown on a small case.
 
     Args:
         n_random: Number of random cases.
-        targets: Targets of the cases; without any, random ones on up to 6 x 6 sites, after all cases of one
+        targets: Targets of the cases. Default random targets on up to 6 x 6 sites, after all cases of one
             or two sites.
     """
     random = np.random.default_rng(225)
@@ -132,7 +132,7 @@ def examples(n_random: int, targets: Sequence[TargetPattern] = ()) -> list[Case]
 
 
 def _of_two_sites() -> list[Case]:
-    """All cases of one site and of two: to be filled, to be empty or neither, with or without an atom."""
+    """All cases of one or two sites, each to be filled, to be empty or neither, with or without an atom."""
     states = [(wish == 1, wish == 2, atom) for wish in range(3) for atom in (False, True)]
     made: list[Case] = []
     for shape in ((1, 1), (1, 2), (2, 1)):
@@ -164,7 +164,7 @@ def loaded(target: TargetPattern, filling: float = 0.75) -> Case:
 
 
 def small_targets() -> list[TargetPattern]:
-    """Targets on the smallest grids: all sites, none, every other one, and all to be empty."""
+    """Targets on the smallest grids, with all sites, none, every other site, and all to be empty."""
     made: list[TargetPattern] = []
     for shape in ((1, 1), (1, 2), (1, 9), (9, 1), (2, 2), (3, 3)):
         none, every = np.zeros(shape, np.bool_), np.ones(shape, np.bool_)
@@ -175,7 +175,7 @@ def small_targets() -> list[TargetPattern]:
 
 
 def extreme_cases(targets: Iterable[TargetPattern]) -> list[Case]:
-    """Each target with no atom, with all, and with one on every other site."""
+    """Each target with no atom, with an atom on every site, and on every other site."""
     return [
         (target, atoms)
         for target in targets
@@ -196,13 +196,13 @@ NO_ATOM_CREATED: Final = "no atom is created: every move takes an atom that is t
 
 
 MAX_WAIT_S: Final = 60.0
-"""Real time after which plan() counts as hung; the first call may compile."""
+"""Real time after which plan() counts as hung. The first call may compile."""
 _SIGNATURE: Final = "def plan(self, occupancy, target)"
 _COPY: Final = "begin plan() with 'occupancy = as_occupancy(occupancy, target.shape)' of labseq.plugin"
 
 
 _HANGING: Final[dict[type, str]] = {}
-"""Class of a planner that hangs -> for which case, so that each is waited for only once."""
+"""Class of a planner that hangs -> the case, so that the suite waits for each planner only once."""
 
 
 def plan_of(
@@ -211,8 +211,8 @@ def plan_of(
     """The plan of a planner.
 
     Raises:
-        ContractViolation: It is not a Plan, or the planner hangs or raises anything but a LabseqError.
-        CallHungError: It has not returned after ``max_wait_s``.
+        ContractViolation: It is not a Plan, or the planner hangs or raises another error than LabseqError.
+        CallHungError: The planner has not returned after ``max_wait_s``.
     """
     case = f"for\n{drawn(target, atoms)}"
     if type(planner) in _HANGING:
@@ -226,14 +226,14 @@ def plan_of(
             raise
         _HANGING[type(planner)] = f"{error} {case}"
         raise ContractViolation(
-            RETURNS_A_PLAN, f"{error} {case}", "end every loop; wait for nothing"
+            RETURNS_A_PLAN, f"{error} {case}", "end every loop, and wait for nothing"
         ) from None
     except Exception as error:
         is_signature = isinstance(error, TypeError) and "argument" in str(error)
         advice = f"write it as '{_SIGNATURE}'" if is_signature else "plan for this case, or raise PlanError"
         raise ContractViolation(RETURNS_A_PLAN, f"it {format_error(error)} {case}", advice) from error
     if not isinstance(plan, Plan):
-        advice = "'return Plan.from_batches(batches)'; a batch is two lists of (row, column): from, to"
+        advice = "'return Plan.from_batches(batches)', a batch being two lists of (row, column), from and to"
         raise ContractViolation(RETURNS_A_PLAN, f"it returned a {type(plan).__name__}", advice)
     return plan
 
@@ -242,7 +242,7 @@ def replay(plan: Plan, atoms: Occupancy) -> Occupancy:
     """Follow every atom, even on illegal paths.
 
     Returns:
-        Where the atoms end, bool (n_rows, n_cols).
+        The final sites of the atoms, bool (n_rows, n_cols).
 
     Raises:
         ContractViolation: A move starts on a site without an atom.
@@ -251,8 +251,8 @@ def replay(plan: Plan, atoms: Occupancy) -> Occupancy:
     for index, batch in enumerate(plan.batches):
         for row, col in batch.from_sites.tolist():
             if (row, col) not in held:
-                what = f"batch {index} takes an atom from ({row}, {col}); there is none for the loading"
-                advice = "follow every atom from batch to batch; rows and columns count from 0"
+                what = f"batch {index} takes an atom from ({row}, {col}), which is empty, for the loading"
+                advice = "follow every atom from batch to batch, with rows and columns counted from 0"
                 raise ContractViolation(NO_ATOM_CREATED, f"{what}\n{_sites(atoms)}", advice)
             held.remove((row, col))
         held.update((row, col) for row, col in batch.to_sites.tolist())
@@ -280,13 +280,13 @@ PASSES_THE_CHECK: Final = "the plan passes labseq.check_plan at the planner's de
 
 
 class PlannerContract:
-    """Promises of a planner; provide the fixture ``factory``.
+    """Promises of a planner. Provide the fixture ``factory``.
 
     Attributes:
-        fills_any_target: Whether it fills every target that the atoms suffice for.
-            If not, it fills ``targets``; for any other target its plan is
+        fills_any_target: Whether the planner fills every target if there are enough atoms.
+            If not, it fills ``targets``, and for any other target its plan is
             legal, or it raises a LabseqError.
-        targets: Some targets that it fills; needed without ``fills_any_target``.
+        targets: Some targets that it fills. Needed without ``fills_any_target``.
         time_limit_s: Longest time for one plan of the paper's size (15 x 15 out of
             20 x 20 sites at 75 % filling) or the largest of ``targets``, in seconds.
         n_examples: Number of random cases per promise.
@@ -299,11 +299,11 @@ class PlannerContract:
 
     @pytest.fixture
     def factory(self) -> PlannerFactory:
-        """Constructs the planner, given a context; provided by the plugin's test."""
+        """Constructs the planner from a context. Provided by the plugin's test."""
         no_factory(self, "context -> planner")
 
     def context(self, shape: tuple[int, int]) -> Context:
-        """The context that the planner is constructed with; override it for other limits of motion."""
+        """Context of the planner. Override it for other limits of motion."""
         return Context("planner", SiteGrid(*shape))
 
     def stopwatch(self) -> float:
@@ -312,7 +312,7 @@ class PlannerContract:
 
     @promise(RETURNS_A_PLAN)
     def test_returns_a_plan(self, factory: PlannerFactory) -> None:
-        """Not a list, not None; for single sites and lines, empty and full loadings, and full size."""
+        """Not a list or None, for single sites and lines, empty and full loadings, and full size."""
         for case in self.extreme_cases():
             self.checked(factory, *case)
         for target, atoms in self.large_cases():
@@ -342,7 +342,7 @@ class PlannerContract:
 
     @promise(
         "the target is filled, and clear sites are emptied, when there are enough atoms",
-        "if it fills only certain targets, set fills_any_target = False and list some of those in targets",
+        "if it fills only certain targets, set fills_any_target = False and list some of them in targets",
     )
     def test_fills_the_target(self, factory: PlannerFactory) -> None:
         """Random small arrays with enough atoms, and one of full size."""
@@ -373,17 +373,17 @@ class PlannerContract:
 
     @promise(
         "the same input gives the same plan",
-        "keep nothing between calls; decide nothing by the order of a set or by a random number",
+        "keep nothing between calls, and do not use the order of a set or random numbers",
     )
     def test_same_input_same_plan(self, factory: PlannerFactory) -> None:
-        """A second time, after other calls, and from a new instance."""
+        """Again, after other calls, and from a new instance."""
         for target, atoms in self.large_cases():
             planner = self.made(factory, self.context(target.shape))
             first = plan_of(planner, same(target), atoms.copy())
             again = {"the second time": plan_of(planner, same(target), atoms.copy())}
             self.answered(planner, same(target), ~atoms)
             again["after another input"] = plan_of(planner, same(target), atoms.copy())
-            again["from a fresh instance"] = self.planned(factory, same(target), atoms.copy())
+            again["from a new instance"] = self.planned(factory, same(target), atoms.copy())
             for when, plan in again.items():
                 assert first.is_same(plan), f"the plan is another {when}"
 
@@ -400,7 +400,7 @@ class PlannerContract:
 
     @promise("read-only and non-contiguous occupancies are planned like others", _COPY)
     def test_takes_any_memory_layout(self, factory: PlannerFactory) -> None:
-        """Recorded occupancies are read-only; a view of a larger array is not contiguous."""
+        """Recorded occupancies are read-only, and a view of a larger array is not contiguous."""
         for target, atoms in self.large_cases():
             expected = target.n_defects(replay(self.planned(factory, target, atoms.copy()), atoms))
             read_only = atoms.copy()
@@ -418,7 +418,7 @@ class PlannerContract:
         "an array that is not an occupancy of the target's shape raises LabseqError or ValueError", _COPY
     )
     def test_refuses_wrong_input(self, factory: PlannerFactory) -> None:
-        """Not a wrong plan, and not an error from deep inside."""
+        """Neither a wrong plan nor an error from deep inside."""
         target, atoms = self.large_cases()[0]
         planner = self.made(factory, self.context(target.shape))
         plan_of(planner, target, atoms.copy())
@@ -435,7 +435,7 @@ class PlannerContract:
 
     @promise(
         "a plan is made within the time limit",
-        "write the loops as kernels (labseq.plugin.kernel); or raise time_limit_s, and timeouts.plan",
+        "write the loops as kernels (labseq.plugin.kernel), or raise time_limit_s and timeouts.plan",
     )
     def test_plans_in_time(self, factory: PlannerFactory) -> None:
         """The best of three, after compiling."""
@@ -448,12 +448,12 @@ class PlannerContract:
                 taken_s.append(self.stopwatch() - start_s)
                 if taken_s[-1] <= self.time_limit_s:
                     break
-            text = f"plan() took {min(taken_s):.3g} s; the limit is {self.time_limit_s:g} s"
+            text = f"plan() took {min(taken_s):.3g} s, and the limit is {self.time_limit_s:g} s"
             assert min(taken_s) <= self.time_limit_s, text
 
     @promise("plan() is pure: no I/O, no change of shared state")
     def test_is_pure(self, factory: PlannerFactory) -> None:
-        """Other plugins draw from the global random numbers too."""
+        """Other plugins also draw from the global random numbers."""
         for target, atoms in self.large_cases():
             planner = self.ready(factory, target)
             plan_of(planner, target, atoms.copy())
@@ -461,7 +461,7 @@ class PlannerContract:
                 planner.plan(atoms.copy(), target)
 
     def made(self, factory: PlannerFactory, context: Context) -> Planner:
-        """A new planner, with its kernels compiled, as in a run: that may take longer than any plan."""
+        """A new planner with compiled kernels, as in a run. Compiling may take longer than any plan."""
         try:
             planner = factory(context)
         except TypeError as error:
@@ -477,11 +477,11 @@ class PlannerContract:
         return planner
 
     def planned(self, factory: PlannerFactory, target: TargetPattern, atoms: Occupancy) -> Plan:
-        """The plan of a new planner; it receives the array itself, not a copy."""
+        """The plan of a new planner, which receives the array itself and not a copy."""
         return plan_of(self.made(factory, self.context(target.shape)), target, atoms)
 
     def answered(self, planner: Planner, target: TargetPattern, atoms: Occupancy) -> Plan | None:
-        """The plan of a planner; None if it refuses a target that it need not fill."""
+        """The plan of a planner. None if it refuses a target that it need not fill."""
         try:
             return plan_of(planner, target, atoms.copy())
         except LabseqError as error:
@@ -491,7 +491,7 @@ class PlannerContract:
             return None
 
     def checked(self, factory: PlannerFactory, target: TargetPattern, atoms: Occupancy) -> PlanReport | None:
-        """The check's report on a new planner's plan; None if it refuses a target that it need not fill."""
+        """The check's report on a new planner's plan. None if it refuses a target that it need not fill."""
         context = self.context(target.shape)
         planner = self.made(factory, context)
         plan = self.answered(planner, target, atoms)
@@ -503,11 +503,11 @@ class PlannerContract:
             return check_plan(plan, atoms, target, dop, grid=context.grid, motion=context.motion)
         except InvalidPlanError as error:
             detail = f"{error}; for\n{drawn(target, atoms)}"
-            advice = f"rule '{error.rule}': {RULES[error.rule]}; 'labseq plan --png' draws such a plan"
+            advice = f"rule '{error.rule}': {RULES[error.rule]} (draw the plan with 'labseq plan --png')"
             raise ContractViolation(PASSES_THE_CHECK, detail, advice) from None
 
     def ready(self, factory: PlannerFactory, target: TargetPattern) -> Planner:
-        """A new planner that has chosen another planner for the target, if it is to choose one."""
+        """A new planner, which has chosen another planner for the target if it makes such a choice."""
         planner = self.made(factory, self.context(target.shape))
         if isinstance(planner, ChoosesPlanner):
             planner.choose(target, math.inf)
@@ -517,19 +517,19 @@ class PlannerContract:
         """Check all cases of one or two sites, and random ones, the smallest first.
 
         Args:
-            check: Given a target and an occupancy.
+            check: Function of a target and an occupancy.
             served: Whether the planner must be able to fill the target.
         """
         for target, atoms in examples(self.n_examples, self.served_targets() if served else ()):
             check(target, atoms)
 
     def served_targets(self) -> Sequence[TargetPattern]:
-        """The targets that it fills; empty if it fills any."""
+        """The targets that the planner fills. Empty if it fills any."""
         if self.fills_any_target or self.targets:
             return () if self.fills_any_target else self.targets
         example = "targets = (labseq.make_target('compact', rows=4, cols=4, grid=(8, 8)),)"
         what = f"{type(self).__name__} has fills_any_target = False and no targets"
-        raise ContractViolation(RETURNS_A_PLAN, what, f"list some that the planner always fills: {example}")
+        raise ContractViolation(RETURNS_A_PLAN, what, f"list some that it always fills: {example}")
 
     def large_cases(self) -> list[Case]:
         """Cases of full size with enough atoms."""
@@ -538,5 +538,5 @@ class PlannerContract:
         )
 
     def extreme_cases(self) -> list[Case]:
-        """Cases at the extremes of size and loading."""
+        """Cases of extreme size and loading."""
         return extreme_cases(small_targets() if self.fills_any_target else self.served_targets())

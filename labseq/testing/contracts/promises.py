@@ -1,4 +1,4 @@
-"""Helpers of the contracts: name the broken promise, and watch what a call does to the process."""
+"""Helpers of the contracts, which name the broken promise and watch the side effects of calls."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ E = TypeVar("E", bound=Exception)
 _FAILURES: Final = (Exception, pytest.fail.Exception)
 
 
-class ContractViolation(AssertionError):  # noqa: N818 - reads as what it is in pytest's summary
+class ContractViolation(AssertionError):  # noqa: N818 - a clear name in pytest's summary
     """A plugin does not do what its role promises.
 
     Attributes:
@@ -48,7 +48,7 @@ class ContractViolation(AssertionError):  # noqa: N818 - reads as what it is in 
 
 
 class CallHungError(AssertionError):
-    """A call has not returned; its thread is abandoned."""
+    """A call has not returned. Its thread is abandoned."""
 
 
 @contextmanager
@@ -64,7 +64,7 @@ def promised(promise: str) -> Generator[None]:
 
 
 def _of_the_plugin(error: BaseException) -> BaseException | None:
-    """The error whose traceback the author needs: one of the plugin's code, not of the suite's."""
+    """The error whose traceback the author needs, from the plugin's code and not the suite's."""
     cause: BaseException | None = error
     while cause is not None and isinstance(cause, AssertionError):
         cause = cause.__cause__
@@ -72,7 +72,7 @@ def _of_the_plugin(error: BaseException) -> BaseException | None:
 
 
 def failure_text(error: ContractViolation) -> str:
-    """What pytest prints: the promise, what happened, what to do, and the lines of the plugin's own code."""
+    """The promise, what happened, what to do, and the lines of the plugin's own code, for pytest."""
     frames = traceback.extract_tb(error.__cause__.__traceback__) if error.__cause__ is not None else []
     here = Path(__file__).parent
     first = next((i for i, f in enumerate(frames) if here not in Path(f.filename).parents), len(frames))
@@ -84,11 +84,11 @@ def failure_text(error: ContractViolation) -> str:
 
 
 def promise(text: str, advice: str = "") -> Callable[[Callable[P, None]], Callable[P, None]]:
-    """Decorate a test of a contract with the promise that it tests, and what to do if it is broken.
+    """Decorate a test of a contract with the promise that it tests, and with advice if it is broken.
 
     The sentence is kept as the test's attribute ``promise``. A test that cannot continue because
-    another promise is broken is skipped if a test of that promise fails, so that a fault is reported once.
-    So is a test that fails while one of the suite's ``bases``, promises that all others need, is broken.
+    another promise is broken is skipped if a test of that promise fails, so a fault is reported once.
+    The same applies if one of the suite's ``bases``, the promises that all others need, is broken.
     """
 
     def decorate(test: Callable[P, None]) -> Callable[P, None]:
@@ -114,7 +114,7 @@ def promise(text: str, advice: str = "") -> Callable[[Callable[P, None]], Callab
 
 
 def _is_reported_elsewhere(promise: str, *args: Any) -> bool:
-    """Whether a test of that promise fails too; ``args`` are the suite and its tests' arguments."""
+    """Whether a test of that promise also fails. ``args`` are the suite and its tests' arguments."""
     suite = args[0]
     tests = (getattr(type(suite), name) for name in dir(suite) if name.startswith("test_"))
     for test in tests:
@@ -128,7 +128,7 @@ def _is_reported_elsewhere(promise: str, *args: Any) -> bool:
 
 @contextmanager
 def doing(what: str) -> Generator[None]:
-    """Add what was being done to the message of a failure inside."""
+    """Add the action in progress to the message of a failure inside."""
     __tracebackhide__ = True
     try:
         yield
@@ -171,7 +171,7 @@ def refusal(
     raise AssertionError(f"{what} was accepted; expected {wanted}")
 
 
-_guard = Guard()  # for all calls: to start a thread takes longer than most of them
+_guard = Guard()  # for all calls, because starting a thread takes longer than most calls
 
 
 def in_time(limit_s: float, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
@@ -192,7 +192,7 @@ def in_time(limit_s: float, what: str, call: Callable[P, T], *args: P.args, **kw
 
 @contextmanager
 def calls_of_sleep(module: str) -> Generator[list[float]]:
-    """The times that code of a module passes to ``time.sleep``, which nothing can interrupt."""
+    """The times that a module passes to ``time.sleep``, which nothing can interrupt."""
     seen: list[float] = []
     sleep = time.sleep
 
@@ -214,13 +214,13 @@ def calls_of_sleep(module: str) -> Generator[list[float]]:
 
 
 def no_factory(suite: object, signature: str) -> NoReturn:
-    """Fail with the fixture that a test class must provide when it inherits a contract."""
+    """Fail because a test class that inherits a contract does not provide the fixture."""
     name = type(suite).__name__
     pytest.fail(f"{name} needs a fixture 'factory' that returns a callable: {signature}", pytrace=False)
 
 
 def format_error(error: BaseException) -> str:
-    """An error as the end of a sentence."""
+    """The text of an error, as the end of a sentence."""
     if isinstance(error, AssertionError | pytest.fail.Exception) and str(error):
         return str(error).split("\nassert ")[0]  # without pytest's explanation of the values
     return f"raised {type(error).__name__}: {error}" if str(error) else f"raised {type(error).__name__}"
@@ -267,7 +267,7 @@ class _Watcher:
             self._local.seen = None
 
     def _hook(self, event: str, args: tuple[Any, ...], events: frozenset[str] = _EVENTS) -> None:
-        if event not in events:  # not _EVENTS, which is gone while Python shuts down
+        if event not in events:  # not _EVENTS, which no longer exists while Python shuts down
             return
         seen: list[str] | None = getattr(self._local, "seen", None)
         if seen is not None and not _is_importing():
@@ -288,7 +288,7 @@ _WATCHER: Final = _Watcher()
 
 
 def watch_io() -> Any:
-    """Context manager: a list of everything that this thread opens inside it; imports do not count.
+    """Context manager that lists everything that this thread opens inside it, except for imports.
 
     Example:
         >>> with watch_io() as seen:
@@ -305,10 +305,10 @@ def _numpy_state() -> tuple[object, ...]:
 
 
 _STATES: Final[Mapping[str, Callable[[], object]]] = {
-    "it drew from random; create your own numpy Generator": random.getstate,
-    "it drew from numpy.random; create your own Generator": _numpy_state,
-    "it changed numpy's error state; use `with numpy.errstate(...)`": np.geterr,
-    "it changed the warnings' filters; use `with warnings.catch_warnings()`": lambda: tuple(warnings.filters),
+    "it drew from random (create your own numpy Generator)": random.getstate,
+    "it drew from numpy.random (create your own Generator)": _numpy_state,
+    "it changed numpy's error state (use `with numpy.errstate(...)`)": np.geterr,
+    "it changed the warning filters (use `with warnings.catch_warnings()`)": lambda: tuple(warnings.filters),
     "it changed the working folder": os.getcwd,
     "it changed the environment's variables": lambda: dict(os.environ),
 }
@@ -332,16 +332,16 @@ def quietly(advice: str = "") -> Generator[None]:
         advice: Added to the message if it does not.
 
     Raises:
-        AssertionError: It did I/O or changed something; the message says what.
+        AssertionError: It did I/O or changed something, which the message names.
     """
     __tracebackhide__ = True
-    random.random()  # so that the state is not what a fixed seed leaves behind
+    random.random()  # so that the state differs from a freshly seeded one
     np.random.random()  # noqa: NPY002 - the global one is what is watched
     before = process_state()
     with redirect_stdout(io.StringIO()) as printed, watch_io() as seen:
         yield
     did = [f"it did {', '.join(seen)}"] if seen else []
     if text := printed.getvalue():
-        did += [f"it printed {text[:40]!r}; use logging.getLogger(__name__)"]
+        did += [f"it printed {text[:40]!r} (use logging.getLogger(__name__))"]
     did += changes_since(before)
     assert not did, "; ".join([*did, advice] if advice else did)

@@ -20,11 +20,11 @@ Factory: TypeAlias = Callable[[Context], Simulation]
 
 LOADING_S: Final = 2.0
 BETWEEN_S: Final = 0.01
-SAME_SEED: Final = "the same seed gives the same frames, and another seed others"
+SAME_SEED: Final = "the same seed gives the same frames, and another seed gives other frames"
 
 
 class SimulationContract:
-    """Promises of a simulation; provide the fixture ``factory``.
+    """Promises of a simulation. Provide the fixture ``factory``.
 
     Attributes:
         exposure_s: Exposure of the test frames, in seconds.
@@ -34,16 +34,16 @@ class SimulationContract:
 
     @pytest.fixture
     def factory(self) -> Factory:
-        """Constructs the simulation, given a context; provided by the plugin's test."""
+        """Constructs the simulation from a context. Provided by the plugin's test."""
         no_factory(self, "context -> simulation")
 
     def context(self, seed: int = 1) -> Context:
-        """The context that the simulation is constructed with; override it for another grid."""
+        """Context of the simulation. Override it for another grid."""
         return Context("simulation", SiteGrid(6, 7), clock=FakeClock(), random=RandomStream(seed))
 
     @contextmanager
     def opened(self, factory: Factory, seed: int = 1) -> Generator[tuple[Simulation, Context]]:
-        """A new simulation, open, with its context; closed at the end."""
+        """A new simulation, open, with its context. Closed at the end."""
         context = self.context(seed)
         simulation = factory(context)
         simulation.open()
@@ -56,7 +56,7 @@ class SimulationContract:
     def shot(
         self, simulation: Simulation, context: Context, index: int, *, lines_on: bool = True
     ) -> list[Frame]:
-        """One shot, as devices play it: the static tweezers on, loading, two frames.
+        """Take one shot as devices play it, with static tweezers on, loading and two frames.
 
         Args:
             simulation: The simulation, open.
@@ -87,7 +87,7 @@ class SimulationContract:
 
     @promise("open() and close() twice do no harm, close() is legal before open(), and it opens again")
     def test_opens_and_closes_twice(self, factory: Factory) -> None:
-        """A scan of its settings opens one after the other."""
+        """A scan of its settings opens one simulation after another."""
         simulation = factory(self.context())
         for method in (
             simulation.close,
@@ -103,7 +103,7 @@ class SimulationContract:
 
     @promise("expose() gives a Frame: uint16 (height, width), with the requested exposure and start")
     def test_gives_frames(self, factory: Factory) -> None:
-        """All of the same shape; a frame does not change when the next one is taken."""
+        """All of the same shape. A frame does not change when the next one is taken."""
         with self.opened(factory) as (simulation, context):
             frames: list[Any] = [*self.shot(simulation, context, 0)]
             copies = [np.array(getattr(frame, "image", 0)) for frame in frames]
@@ -127,16 +127,16 @@ class SimulationContract:
 
     @promise(SAME_SEED)
     def test_same_seed_same_frames(self, factory: Factory) -> None:
-        """So a run can be repeated."""
+        """So that a run can be repeated."""
         frames = {
             name: self._shots(factory, (0, 1), seed) for name, seed in (("1", 1), ("again", 1), ("2", 2))
         }
         assert _equal(frames["1"], frames["again"]), "the second simulation with seed 1 shows other frames"
         assert not _equal(frames["1"], frames["2"]), "simulations with the seeds 1 and 2 show the same frames"
 
-    @promise("a shot does not depend on those before it")
+    @promise("a shot does not depend on earlier shots")
     def test_shots_are_independent(self, factory: Factory) -> None:
-        """So a resumed run gives the same data; no atom outlives a shot."""
+        """So that a resumed run gives the same data. No atom outlives a shot."""
         after_others = self._shots(factory, (0, 1, 2), 1)[-2:]
         alone = self._shots(factory, (2,), 1)
         with promised(SAME_SEED):
@@ -145,7 +145,7 @@ class SimulationContract:
 
     @promise("atoms are loaded where static tweezers are on, and begin_shot() removes them")
     def test_loads_atoms(self, factory: Factory) -> None:
-        """For a simulation that reports the truth."""
+        """For a simulation that reports the true occupancy."""
         with self.opened(factory) as (simulation, context):
             if simulation.truth() is None:
                 return
@@ -198,7 +198,7 @@ class SimulationContract:
 
     @promise("it draws from the context's random numbers alone and changes no shared state")
     def test_is_pure(self, factory: Factory) -> None:
-        """Other plugins draw from the global random numbers too."""
+        """Other plugins also draw from the global random numbers."""
         with self.opened(factory) as (simulation, context):
             self.shot(simulation, context, 0)  # the first call may compile
             with quietly():

@@ -29,7 +29,7 @@ from labseq.testing.fakes import FakeLab, RecordingObserver, fake_lab
 Factory: TypeAlias = Callable[[], Step]
 
 _BARS: Final = "return a list of TimelineEntry(label, min_duration_s, duration_s)"
-TIMELINE: Final = "the timeline is known beforehand: labelled bars with 0 <= min_duration_s <= duration_s"
+TIMELINE: Final = "the timeline is known beforehand, as labelled bars with 0 <= min_duration_s <= duration_s"
 
 
 RUNS: Final = "run(shot) works on the devices of a shot that has taken an image"
@@ -40,28 +40,28 @@ _MOVE_ATOMS: Final = frozenset(
 
 
 class StepContract:
-    """Promises of a step; provide the fixture ``factory``, which takes nothing here.
+    """Promises of a step. Provide the fixture ``factory``, which has no arguments here.
 
-    Devices are fakes. The detector sees 4 x 4 sites full of atoms but for one that
-    the target wants filled, image after image.
+    Devices are fakes. In every image the detector sees 4 x 4 sites full of atoms, except for one site that
+    the target requires to be filled.
     """
 
     bases: ClassVar[tuple[str, ...]] = (RUNS,)
 
     @pytest.fixture
     def factory(self) -> Factory:
-        """Constructs the step; provided by the plugin's test."""
+        """Constructs the step. Provided by the plugin's test."""
         no_factory(self, "nothing -> step")
 
     def lab(self) -> FakeLab:
-        """Where the step runs; override it for devices or occupancies that it needs."""
+        """The lab in which the step runs. Override it for devices or occupancies that the step needs."""
         seen = np.ones((4, 4), np.bool_)
         seen[1, 1] = False
         fill = np.zeros((4, 4), np.bool_)
         fill[1:3, 1:3] = True
         return fake_lab([seen], fill=fill, simulated=True)
 
-    @promise(RUNS, "write it as 'def run(self, shot)'; every duration is in seconds, every length in metres")
+    @promise(RUNS, "write it as 'def run(self, shot)', with durations in seconds and lengths in metres")
     def test_runs(self, factory: Factory) -> None:
         """Nothing else can be tested without it."""
         step = factory()
@@ -70,7 +70,7 @@ class StepContract:
 
     @promise(TIMELINE, _BARS)
     def test_lays_out_its_timeline(self, factory: Factory) -> None:
-        """``labseq check`` prints it and adds it up."""
+        """``labseq check`` prints the timeline and adds it up."""
         for entry in self._timeline(factory()):
             assert entry.label, f"{entry} has no label"
             assert 0.0 <= entry.min_duration_s <= entry.duration_s < float("inf"), f"{entry}"
@@ -82,11 +82,11 @@ class StepContract:
         with quietly():
             step = factory()
             first = self._timeline(step)
-        assert self._timeline(step) == first, "the second call gave a different one"
+        assert self._timeline(step) == first, "the second call gave a different timeline"
 
     @promise("needs_image and takes_image are known before the run")
     def test_declares_its_images(self, factory: Factory) -> None:
-        """The order of the steps is checked by them."""
+        """The order of the steps is checked with them."""
         step = factory()
         for name in ("needs_image", "takes_image"):
             value: Any = getattr(step, name)
@@ -98,7 +98,7 @@ class StepContract:
         "camera (context.camera.readout_s) included, and the number of images",
     )
     def test_keeps_its_timeline(self, factory: Factory) -> None:
-        """Measured on the virtual clock; a timeline without lengths promises none."""
+        """Measured on the virtual clock. A timeline without lengths promises no limit."""
         step = factory()
         bars = self._timeline(step)
         with self.shot() as (shot, _):
@@ -108,12 +108,12 @@ class StepContract:
             assert not slept_s, f"it called time.sleep({slept_s[0]:g}); wait with shot.clock.sleep"
             taken_s, n_taken = shot.elapsed_s - start_s, len(shot.record.images) - n_before
         planned_s, n_planned = sum(bar.duration_s for bar in bars), sum(bar.n_images for bar in bars)
-        assert taken_s <= planned_s + 1e-6 or not planned_s, f"it took {taken_s} s; planned {planned_s} s"
-        assert n_taken <= n_planned, f"it took {n_taken} images; planned {n_planned}"
+        assert taken_s <= planned_s + 1e-6 or not planned_s, f"it took {taken_s} s, not {planned_s} s"
+        assert n_taken <= n_planned, f"it took {n_taken} images, not {n_planned}"
 
     @promise("a `repeatable` step leaves the atoms alone, and can run again in the same shot")
     def test_runs_again(self, factory: Factory) -> None:
-        """So that a failed attempt can be repeated; by default a step is not repeatable."""
+        """So that a failed attempt can be repeated. By default a step is not repeatable."""
         step = factory()
         repeatable: Any = step.repeatable
         assert isinstance(repeatable, bool), f"repeatable is {repeatable!r}"
@@ -125,11 +125,11 @@ class StepContract:
                 with doing(f"the {count} run"):
                     step.run(shot)
             done = [name for name in lab.calls.names()[before:] if name in _MOVE_ATOMS]
-            assert not done, f"it is repeatable, and called {', '.join(dict.fromkeys(done))}"
+            assert not done, f"it is repeatable, but called {', '.join(dict.fromkeys(done))}"
 
     @promise(
         "a stop request ends it with StopRequested",
-        "wait with shot.clock.sleep and call devices with shot.call; time.sleep ignores a stop request",
+        "wait with shot.clock.sleep and call devices with shot.call (time.sleep ignores a stop request)",
     )
     def test_hears_a_stop_request(self, factory: Factory) -> None:
         """It waits and calls devices through the shot, which checks for stop requests."""

@@ -1,4 +1,4 @@
-"""What static and mobile tweezers promise."""
+"""Promises of static and mobile tweezers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
     too_deep: ClassVar[float] = 10.0
 
     def work(self, device: StaticTweezers) -> None:
-        """Turn on, lower, raise."""
+        """Turn on, lower and raise the array."""
         device.load(None)
         device.start()
         if device.facts.ramps:
@@ -109,7 +109,7 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
             assert depth == 1.0, f"the depth is {depth} after start(); expected 1"
             assert not before or _n_played(context) > before, "start() after a ramp played nothing"
 
-    @promise("ramp() takes every depth from 0 to 1, and a duration of 0; none between if `facts` say so")
+    @promise("ramp() takes every depth from 0 to 1 (or only 0 and 1 if `facts` say so), and a duration of 0")
     def test_ramps(self, factory: Factory[StaticTweezers]) -> None:
         """Down to 0 and back."""
         with self.opened(factory) as (tweezers, _):
@@ -142,7 +142,7 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
 
     @promise("load_weights(), if `facts` offer it, takes a weight above 0 for each site")
     def test_loads_weights(self, factory: Factory[StaticTweezers]) -> None:
-        """The array stays as it is while it is on; amplitudes of tones and wrong weights are refused."""
+        """The array stays as it is while it is on. Amplitudes of tones and wrong weights are refused."""
         with self.opened(factory) as (tweezers, context):
             if tweezers.facts.control != "sites":
                 return
@@ -163,7 +163,7 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
 
     @promise("load() takes None, or one amplitude for each row and column, and leaves them untouched")
     def test_loads_amplitudes(self, factory: Factory[StaticTweezers]) -> None:
-        """Calibrated ones, then given ones; LimitError where no tones can be set."""
+        """Calibrated amplitudes, then given ones. LimitError if no tones can be set."""
         with self.opened(factory) as (tweezers, context):
             with doing("load(None)"):
                 tweezers.load(None)
@@ -201,7 +201,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
     timeout_s: ClassVar[float] = 2.0
 
     def program(self) -> ToneProgram:
-        """The program to play: one atom moves along a row of the grid, then another down a column."""
+        """The program to play. One atom moves along a row of the grid, then another down a column."""
         context = self.context()
         n_rows, n_cols = context.grid.shape
         there, below = min(2, n_cols - 1), min(2, n_rows - 1)
@@ -209,7 +209,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
         return tone_program(plan, grid=context.grid, motion=context.motion)
 
     def work(self, device: MobileTweezers) -> None:
-        """Prepare, play, wait; the same in two parts if the tweezers can."""
+        """Prepare, play, wait. Then the same in two parts if the tweezers can."""
         duration_s = device.prepare(self.program())
         device.play()
         device.wait(duration_s + self.timeout_s)
@@ -268,7 +268,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
         }
 
     def waits(self) -> Mapping[str, Wait[MobileTweezers]]:
-        """For a program longer than the timeout."""
+        """Waits for a program longer than the timeout."""
         timeout_s = 0.1 * self.program().total_duration_s
         return {
             "wait() shorter than the program": Wait(
@@ -278,11 +278,11 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
 
     @promise("prepare() returns the playing time, not less than the program's")
     def test_tells_the_playing_time(self, factory: Factory[MobileTweezers]) -> None:
-        """The sequencer waits that long."""
+        """The sequencer waits for this time."""
         with self.opened(factory) as (tweezers, _):
             wanted_s = self.program().total_duration_s
             duration_s = tweezers.prepare(self.program())
-            text = f"prepare() returned {duration_s!r}; the program takes {wanted_s} s"
+            text = f"prepare() returned {duration_s!r}, but the program takes {wanted_s} s"
             assert math.isfinite(duration_s), text
             assert duration_s >= wanted_s - 1e-9, text
 
@@ -311,11 +311,11 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
             refusal(DeviceError, "play() after open()", tweezers.play)
 
     @promise(
-        "after safe_state() neither play() nor a trigger plays what was prepared",
-        "let safe_state() drop the prepared program, and disarm what waits for its trigger",
+        "after safe_state() neither play() nor a trigger plays the prepared program",
+        "let safe_state() drop the prepared program, and disarm everything that waits for its trigger",
     )
     def test_drops_its_program(self, factory: Factory[MobileTweezers]) -> None:
-        """In every state; then with a trigger, for tweezers that a line can start."""
+        """In every state. Then with a trigger, for tweezers that a line can start."""
         with self.each_state(factory) as states:
             for state, tweezers, _ in states:
                 tweezers.safe_state()
@@ -335,7 +335,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
         "timings(), if there is one, gives the seconds that parts of the last prepare() took, without I/O"
     )
     def test_tells_its_timings(self, factory: Factory[MobileTweezers]) -> None:
-        """They are recorded for every cycle, in the middle of a shot."""
+        """The timings are recorded for every cycle, in the middle of a shot."""
         with self.opened(factory) as (tweezers, _):
             start_s = perf_counter()
             tweezers.prepare(self.program())
@@ -345,7 +345,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
             assert isinstance(timings, Mapping), f"timings() gave a {type(timings).__name__}"
             for part, taken_s in cast("Mapping[Any, Any]", timings).items():
                 assert isinstance(part, str), f"timings() names a part {part!r}; expected text"
-                text = f"timings() gives {taken_s!r} s for '{part}'; prepare() took {limit_s:.2g} s at most"
+                text = f"timings() gives {taken_s!r} s for '{part}', but prepare() took {limit_s:.2g} s"
                 assert 0.0 <= taken_s <= limit_s, text
 
     @promise("an empty program is played, or refused with LimitError")

@@ -1,4 +1,4 @@
-"""Fakes for tests: a clock, devices that record every call, scripted planners, detectors and scanners."""
+"""Fakes for tests, such as a clock, devices that record every call, and scripted planners and detectors."""
 
 from labseq.testing.fakes.devices import (
     Call,

@@ -1,4 +1,4 @@
-"""In-memory devices of every role; they record every call."""
+"""In-memory devices of every role, which record every call."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from labseq.sequencer.clock import VirtualClock
 from labseq.sequencer.lines import idle_program, off_program
 
 Failure: TypeAlias = BaseException | Sequence[BaseException | None]
-"""An error raised at every call; or a sequence of errors for successive calls, None for a call that works."""
+"""An error for every call, or a sequence of errors for successive calls (None for a call that works)."""
 
 
 class Call(NamedTuple):
@@ -65,7 +65,7 @@ class Calls(list[Call]):
     """A list of calls that all fakes of a test share.
 
     Args:
-        clock: Gives each call its time; without one all times are 0.
+        clock: Gives each call its time. Without a clock all times are 0.
 
     Example:
         >>> calls = Calls()
@@ -87,7 +87,7 @@ class Calls(list[Call]):
         self.append(Call(device, method, args, kwargs, t_s))
 
     def names(self, *devices: str) -> list[str]:
-        """Names of the calls, such as "camera.arm"; of the given devices, or of all."""
+        """Names of the calls, such as "camera.arm", for the given devices or all."""
         return [call.name for call in self if not devices or call.device in devices]
 
     def of(self, name: str) -> list[Call]:
@@ -99,7 +99,7 @@ class Hang:
     """A call that does not return until the test releases it.
 
     Attributes:
-        reached: Set when the call has begun to hang; wait for it in the test.
+        reached: Set when the call has begun to hang. Wait for it in the test.
         release: Set it to let the call continue.
     """
 
@@ -114,14 +114,14 @@ class Hang:
 
 
 class Faults:
-    """The planned failures and hangs of one device, by method."""
+    """Planned failures and hangs of one device, by method."""
 
     def __init__(self, fail_on: Mapping[str, Failure], hang_on: Mapping[str, Hang]) -> None:
         self._failures = {method: _in_turn(failure) for method, failure in fail_on.items()}
         self._hangs = hang_on
 
     def inject_fault(self, method: str) -> None:
-        """Hang or raise if this is planned for the method."""
+        """Hang or raise if planned for the method."""
         if method in self._hangs:
             self._hangs[method].wait()
         failure = next(self._failures.get(method, iter(())), None)
@@ -141,7 +141,7 @@ class FakeClock(VirtualClock):
     """Virtual time that records every wait.
 
     Attributes:
-        stop: The stop request that its waits check.
+        stop: The stop request that the waits check.
         sleeps: Every wait in seconds, in order.
 
     Example:
@@ -166,11 +166,11 @@ class RecordingHardware(Hardware):
     """A device in memory that keeps the promises of its role and records every call.
 
     Args:
-        context: As passed to a plugin's factory; by default the role's name and
+        context: As passed to a plugin's factory. Default the role's name and
             a :class:`FakeClock`.
-        calls: The list for the calls; share one list between the devices of a test.
-        fail_on: Method -> what it raises, for example ``{"play": DeviceError(...)}``.
-        hang_on: Method -> the :class:`Hang` that it waits for.
+        calls: The list for the calls. Share one list between the devices of a test.
+        fail_on: Method -> the error that it raises, for example ``{"play": DeviceError(...)}``.
+        hang_on: Method -> the :class:`Hang` in which it waits.
 
     Attributes:
         calls: Every call so far.
@@ -218,7 +218,7 @@ class RecordingHardware(Hardware):
         return {"model": type(self).__name__, "serial_number": "fake"}
 
     def reset(self) -> None:
-        """Reset the state of the role; overridden by roles that have one."""
+        """Reset the state of the role. Overridden by roles that have a state."""
 
     def note(self, method: str, *args: Any, **kwargs: Any) -> None:
         """Record a call, then hang or fail if the test has planned it."""
@@ -236,14 +236,14 @@ def require_within(name: str, value: float, lowest: float, highest: float) -> No
     """Refuse a number outside its limits, nan included.
 
     Raises:
-        LimitError: It is outside.
+        LimitError: The number is outside its limits.
     """
     if not (math.isfinite(value) and lowest <= value <= highest):
         raise LimitError(name, value, f"{lowest:g} to {highest:g}")
 
 
 class RecordingCamera(RecordingHardware, Camera):
-    """A camera whose frame k is full of k: uint16 (16, 16)."""
+    """A camera whose frame k has the value k in every pixel, uint16 (16, 16)."""
 
     role: ClassVar[str] = "camera"
 
@@ -275,7 +275,7 @@ class RecordingCamera(RecordingHardware, Camera):
         self.reset()
 
     def trigger(self) -> None:
-        """Take the next frame; it can be read at the end of its exposure."""
+        """Take the next frame, which can be read at the end of its exposure."""
         self.use("trigger")
         if self._n_left == 0:
             raise DeviceError(self.name, "trigger() needs arm() with frames left")
@@ -301,7 +301,7 @@ class RecordingStaticTweezers(RecordingHardware, StaticTweezers):
     """Static tweezers that only know their depth.
 
     Attributes:
-        depth: Fraction of the nominal depth, now.
+        depth: Present fraction of the nominal depth.
     """
 
     role: ClassVar[str] = "static_tweezers"
@@ -337,11 +337,11 @@ class RecordingStaticTweezers(RecordingHardware, StaticTweezers):
 
     @property
     def facts(self) -> TweezersFacts:
-        """They release for any time."""
+        """Facts of tweezers that can release for any time."""
         return TweezersFacts(shortest_release_s=0.0)
 
     def release(self, duration_s: float) -> float:
-        """Be dark for a time; an error that is planned for it comes after the light is back."""
+        """Be dark for a time. A planned error comes after the light is back."""
         require_within("the release in seconds", duration_s, 1e-9, 3600.0)
         self.clock.sleep(duration_s)
         self.use("release", duration_s)
@@ -356,7 +356,7 @@ class RecordingStaticTweezers(RecordingHardware, StaticTweezers):
 
 
 class RecordingMobileTweezers(RecordingHardware, MobileTweezers):
-    """Mobile tweezers that keep the programs they were given.
+    """Mobile tweezers that keep their programs.
 
     Attributes:
         programs: Every program that was prepared, in order.
@@ -370,7 +370,7 @@ class RecordingMobileTweezers(RecordingHardware, MobileTweezers):
         self.reset()
 
     def reset(self) -> None:
-        """Silence."""
+        """Stop playing and forget the program."""
         self._prepared: ToneProgram | None = None
         self._end_s = float("nan")
 
@@ -387,7 +387,7 @@ class RecordingMobileTweezers(RecordingHardware, MobileTweezers):
         return program.total_duration_s
 
     def play(self) -> None:
-        """Start what was prepared."""
+        """Start the prepared program."""
         self.use("play")
         if self._prepared is None:
             raise DeviceError(self.name, "play() needs prepare()")
@@ -397,7 +397,7 @@ class RecordingMobileTweezers(RecordingHardware, MobileTweezers):
         self._end_s = start_s + self._prepared.total_duration_s
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for its end."""
+        """Wait for the end of the program."""
         self.use("wait", timeout_s)
         if np.isnan(self._end_s):
             raise DeviceError(self.name, "wait() needs play()")
@@ -424,18 +424,18 @@ class RecordingLines(RecordingHardware, Lines):
         self.reset()
 
     def idle(self) -> None:
-        """On where the profile says so."""
+        """Turn on the lines that are on at rest in the profile."""
         self.use("idle")
         self._apply_lines(idle_program(self._specs))
 
     def safe_state(self) -> None:
-        """All off."""
+        """Turn all lines off."""
         super().safe_state()
         if self.is_open:
             self._apply_lines(off_program(self._specs))
 
     def reset(self) -> None:
-        """Nothing compiled, nothing armed."""
+        """Forget the compiled program."""
         self._compiled: LineProgram | None = None
         self._is_armed = False
         self._over_s = 0.0
@@ -456,7 +456,7 @@ class RecordingLines(RecordingHardware, Lines):
         self._is_armed = True
 
     def fire(self) -> None:
-        """Start what was compiled."""
+        """Start the compiled program."""
         self.use("fire")
         if not self._is_armed or self._compiled is None:
             raise DeviceError(self.name, "fire() needs arm()")
@@ -466,7 +466,7 @@ class RecordingLines(RecordingHardware, Lines):
         self._over_s = self.clock.now() + self._compiled.duration_s
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for its end."""
+        """Wait for the end of the program."""
         self.use("wait", timeout_s)
         left_s = self._over_s - self.clock.now()
         self.clock.sleep(max(0.0, min(left_s, timeout_s)))
@@ -479,11 +479,11 @@ class RecordingLines(RecordingHardware, Lines):
 
 
 class RecordingDevice(RecordingHardware, Device):
-    """An instrument whose commands do nothing but set ``values["state"]``.
+    """An instrument whose commands only set ``values["state"]``.
 
     Attributes:
-        commands: The commands that it knows.
-        values: What it can be asked for.
+        commands: Known commands.
+        values: Values that can be read.
     """
 
     def __init__(
@@ -499,7 +499,7 @@ class RecordingDevice(RecordingHardware, Device):
         self.values: dict[str, Any] = {"state": "off"}
 
     def check_command(self, name: str, **arguments: Any) -> None:  # noqa: ARG002 - takes any
-        """Refuse a command that it does not have."""
+        """Refuse an unknown command."""
         if name not in self.commands:
             raise unknown_name(self.name, "command", name, self.commands)
 
@@ -510,7 +510,7 @@ class RecordingDevice(RecordingHardware, Device):
         self.values["state"] = name
 
     def read(self, name: str) -> Any:
-        """Give a value."""
+        """Return a value."""
         self.use("read", name)
         if name not in self.values:
             raise unknown_name(self.name, "value", name, tuple(self.values))
@@ -521,9 +521,9 @@ class RecordingLeader(RecordingDevice):
     """An external control system that sends `go` some time after wait_for(), and records the answers.
 
     Attributes:
-        goes_after_s: That time, in seconds.
+        goes_after_s: Time after wait_for(), in seconds.
         answers: The state reported for each `go`, with its details that are numbers and text.
-        noted: Events that new_events() returns, once.
+        noted: Events that new_events() returns once.
     """
 
     role: ClassVar[str] = "leader"

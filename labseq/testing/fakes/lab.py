@@ -45,7 +45,7 @@ class ScriptedDetector:
     """Returns the given occupancies, one after another, whatever the frame shows.
 
     Args:
-        occupancies: The occupancies in order; the last one is repeated.
+        occupancies: The occupancies in order. The last one is repeated.
 
     Attributes:
         frames: The frames received.
@@ -71,7 +71,7 @@ class ScriptedDetector:
 
 
 class ScriptedPlanner:
-    """Returns the given plans, one after another; the last one is repeated.
+    """Returns the given plans, one after another. The last one is repeated.
 
     Args:
         plans: :class:`labseq.Plan`, or anything else that a faulty planner may return.
@@ -97,7 +97,7 @@ class ScriptedScanner:
     It counts the points visited, not its calls, so it can be called again.
 
     Args:
-        points: Address -> value each, or anything else that a faulty scanner may return; exceptions
+        points: Mappings from address to value, or anything else that a faulty scanner may return. Exceptions
             are raised.
 
     Attributes:
@@ -118,7 +118,7 @@ class ScriptedScanner:
 
 
 class RecordingSimulation(Simulation):
-    """A simulation without atoms that records what devices play; it exposes black frames.
+    """A simulation without atoms that records the signals of devices and exposes black frames.
 
     Args:
         calls: The list for the calls.
@@ -151,11 +151,11 @@ class RecordingSimulation(Simulation):
         self.calls.note("simulation", "play", role, signal, t_start_s)
 
     def wire(self, role: str, on_pulse: Callable[[float, float], object]) -> None:
-        """Keep what a device does at a pulse, for :meth:`pulse`."""
+        """Keep a device's action at a pulse, for :meth:`pulse`."""
         self._wires[role] = on_pulse
 
     def pulse(self, role: str, t_s: float, width_s: float) -> None:
-        """Make a pulse of the line that triggers a role; no effect if no device is wired to it."""
+        """Pulse the line that triggers a role. No effect if no device is wired to it."""
         if role in self._wires:
             self._wires[role](t_s, width_s)
 
@@ -165,12 +165,12 @@ class RecordingSimulation(Simulation):
         return self._frame_shape
 
     def readout_fraction(self, mode: SensorMode) -> float:
-        """Every frame takes as long to read as any other."""
+        """1, because every frame takes the same time to read."""
         del mode
         return 1.0
 
     def prepare_sensor(self, mode: SensorMode) -> None:
-        """Nothing to compute."""
+        """Do nothing."""
 
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
         """A black frame."""
@@ -221,22 +221,22 @@ def fake_lab(
     stop: StopFlag | None = None,
     **parts: Any,
 ) -> FakeLab:
-    """Build a lab of fakes; the devices are not open yet.
+    """Build a lab of fakes. The devices are not open yet.
 
     Args:
-        occupancies: The detector's answers, image after image, the last one repeated;
-            by default every site holds an atom.
-        grid: The grid of sites; by default as large as the occupancies, or 4 x 4.
-        fill: Sites that must hold an atom, of the grid's shape; by default all.
+        occupancies: The detector's answers, image after image, the last one repeated.
+            By default every site holds an atom.
+        grid: The grid of sites. By default as large as the occupancies, or 4 x 4.
+        fill: Sites that must hold an atom, of the grid's shape. By default all.
             The other sites are reservoir. For more, give ``target``.
-        devices: Names of the further devices; each knows the commands "on" and "off".
-        fail_on: Call -> what it raises, for example ``{"camera.read": DeviceError(...)}``.
-        hang_on: Calls that hang, for example ``{"mobile_tweezers.wait"}``; see
+        devices: Names of further devices. Each knows the commands "on" and "off".
+        fail_on: Call -> the error that it raises, for example ``{"camera.read": DeviceError(...)}``.
+        hang_on: Calls that hang, for example ``{"mobile_tweezers.wait"}``, see
             :attr:`FakeLab.hangs`.
-        line_specs: The lines of a timing box; none: there is no box.
+        line_specs: The lines of a timing box. Without lines there is no box.
         simulated: Whether there is a :class:`RecordingSimulation`.
         clock: By default a :class:`FakeClock` that checks ``stop``.
-        stop: The stop request; by default a new one.
+        stop: The stop request. By default a new one.
         **parts: Fields of ``labseq.sequencer.lab.Lab`` that replace the fakes.
 
     Raises:
@@ -292,10 +292,10 @@ def _make_hardware(
         fake = _FAKE_OF_ROLE.get(name, RecordingDevice)
         failures, hangs = _of_device(name, fail_on), _of_device(name, hang_on)
         hardware[name] = fake(replace(context, name=name), calls, fail_on=failures, hang_on=hangs)
-    for call in (*fail_on, *hang_on):  # a misspelt call would never fail
+    for call in (*fail_on, *hang_on):  # because a misspelt call would never fail
         device, _, method = call.rpartition(".")
         if not hasattr(hardware.get(device), method):
-            raise ValueError(f"no fake has the call '{call}'; expected 'camera.read' or the like")
+            raise ValueError(f"no fake has the call '{call}'; expected a call such as 'camera.read'")
     return hardware
 
 
@@ -315,12 +315,12 @@ class ListSink:
         self.shots: list[ShotRecord] = []
 
     def write_shot(self, shot: ShotRecord) -> None:
-        """Keep it."""
+        """Keep the shot."""
         self.shots.append(shot)
 
 
 class RecordingObserver:
-    """Keeps the events of a run; implements ``labseq.roles.RunObserver``.
+    """Keeps the events of a run. Implements ``labseq.roles.RunObserver``.
 
     Attributes:
         events: (name, values) of each, in order.
@@ -330,7 +330,7 @@ class RecordingObserver:
         self.events: list[tuple[str, Mapping[str, Any]]] = []
 
     def event(self, name: str, values: Mapping[str, Any]) -> None:
-        """Keep it."""
+        """Keep the event."""
         self.events.append((name, values))
 
     @property

@@ -33,10 +33,10 @@ _STEPS: Final = ((-1, 0), (0, -1), (0, 1), (1, 0))
 
 
 class OneByOnePlanner:
-    """Moves one atom at a time, along shortest paths; fills any target and clears it.
+    """Moves one atom at a time along shortest paths, fills any target and clears its other sites.
 
     It is slow and simple, a reference for tests. Each defect, starting at the target's centre, pulls the
-    nearest atom that the target does not need: every atom on the path between them moves to the next free
+    nearest atom that the target does not need. Every atom on the path between them moves to the next free
     site. Atoms on clear sites are then pushed to the nearest free reservoir site, or over the edge, in the
     same way.
 
@@ -51,7 +51,7 @@ class OneByOnePlanner:
         del settings, context  # the signature of every factory
 
     def plan(self, occupancy: Occupancy, target: TargetPattern) -> Plan:
-        """Plan the moves that fill the target, or as much of it as the atoms suffice for.
+        """Plan the moves that fill the target, or as much of it as there are atoms for.
 
         Raises:
             ValueError: The array is not an occupancy of the target's shape.
@@ -85,7 +85,7 @@ def _from_the_centre(sites: np.ndarray) -> Iterator[Site]:
 def _path(
     shape: tuple[int, ...], start: Site, is_end: Callable[[Site], bool], *, may_leave: bool = False
 ) -> list[Site] | None:
-    """The shortest path of neighbouring sites to the nearest end; None if there is none."""
+    """The shortest path of neighbouring sites to the nearest end, or None."""
     came_from: dict[Site, Site] = {start: start}
     queue = deque([start])
     while queue:
@@ -105,7 +105,7 @@ def _path(
 
 
 def _shift(atoms: Occupancy, path: Sequence[Site]) -> Iterator[Batch]:
-    """Move every atom of a path on by one free site, towards the first site of the path, which is free."""
+    """Move every atom of a path to the next free site, towards the first site of the path, which is free."""
     free = 0
     for place in range(1, len(path)):
         if not atoms[path[place]]:
@@ -155,12 +155,12 @@ def fake_calibration(
     """Make a calibration of any kind, with sites 10 px apart and the tones of the grid.
 
     Args:
-        kind: Its kind.
-        grid: The grid of sites; by default the paper's.
+        kind: Kind of calibration.
+        grid: The grid of sites. Default the paper's.
         values: Values that replace the default ones.
         quality: Figures of merit that replace the default ones.
         origin: Provenance of the calibration.
-        taken_utc: When it was made.
+        taken_utc: Time when the calibration was made.
 
     Example:
         >>> fake_calibration("overlay", values={"offset_m": [1e-7, 0.0]}).values["offset_m"].tolist()
@@ -205,7 +205,7 @@ def _values(kind: CalibrationKind, grid: SiteGrid) -> Mapping[str, ArrayLike]:
 
 @dataclass(frozen=True)
 class FakeShot:
-    """A recorded shot as passed to an analysis; implements ``RecordedShot``."""
+    """A recorded shot as passed to an analysis. Implements ``RecordedShot``."""
 
     index: int
     target: TargetPattern
@@ -218,12 +218,12 @@ class FakeShot:
 
     @property
     def success(self) -> bool:
-        """Whether its last image meets the target."""
+        """Whether the last image meets the target."""
         return bool(self.images) and self.target.is_met_by(self.images[-1].occupancy)
 
     @property
     def filling_fraction(self) -> float:
-        """Filling of the target on its last image; nan without one."""
+        """Filling of the target on the last image. nan without an image."""
         return self.target.filling_fraction(self.images[-1].occupancy) if self.images else float("nan")
 
     @property
@@ -246,15 +246,15 @@ def fake_shot(
     filling: float = 0.75,
     frame_shape: tuple[int, int] | None = (32, 32),
 ) -> FakeShot:
-    """Make a reproducible shot: atoms load, each cycle moves some, each image loses some.
+    """Make a reproducible shot, in which each cycle moves some atoms and each image loses some.
 
     Args:
         shape: (n_rows, n_cols).
         index: Index of the shot in the run.
         n_images: Number of images.
-        n_cycles: Number of images that end a cycle; they come after the first image.
+        n_cycles: Number of images that end a cycle. They come after the first image.
         filling: Fraction of loaded sites.
-        frame_shape: (height, width) of the frames; None if none were kept.
+        frame_shape: (height, width) of the frames. None if no frames were kept.
 
     Example:
         >>> shot = fake_shot((3, 4), n_images=3, n_cycles=1)
