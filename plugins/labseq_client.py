@@ -1,11 +1,11 @@
-"""Start shots of labseq from another control system. Copy this file: it needs Python 3.7 or later alone.
+"""Start shots of labseq from another control system. Copy this file, which only needs Python 3.7 or later.
 
     with Leader() as labseq:
         # load atoms here
         labseq.go("run 17", {"shot.hold.duration": "5 ms"})
         answer = labseq.wait()
         if answer.is_ready:
-            print(answer.filling, answer.after)  # rows of booleans; an array if numpy is installed
+            print(answer.filling, answer.after)  # rows of booleans, or an array if numpy is installed
 
 labseq runs a sequence with a step `wait: {for: go, timeout: 10 s}`. This file speaks version 3 of the
 protocol, which docs/how-to/follow.md describes.
@@ -31,15 +31,15 @@ VERSION = 3
 
 
 class LabseqError(Exception):
-    """labseq refused what it was sent; the text is its reason."""
+    """labseq refused a message. The text is labseq's reason."""
 
 
 class Image:
     """An image of a shot.
 
     Attributes:
-        name: Its name in the shot's file.
-        facts: All that labseq said about it; times in seconds after `go`.
+        name: Name in the shot's file.
+        facts: Everything that labseq sent about it, with times in seconds after `go`.
     """
 
     def __init__(self, facts: dict[str, Any], shape: tuple[int, int]) -> None:
@@ -49,7 +49,7 @@ class Image:
 
     @property
     def occupancy(self) -> Any:
-        """Which sites hold an atom: a list of rows of booleans, or an array if numpy is installed."""
+        """The sites with atoms, as a list of rows of booleans, or an array if numpy is installed."""
         n_rows, n_cols = self._shape
         packed = bytes.fromhex(self.facts["occupancy"])
         if np is not None:
@@ -63,15 +63,15 @@ class Answer:
     """How a shot ended.
 
     Attributes:
-        is_ready: True if labseq finished its shot; False if it failed, and the atoms may be lost.
-        is_refused: True if labseq refused the values of `go`; it has not touched the atoms.
-        reason: Why it failed; "" if it is ready.
-        shot: Number of the shot in the run, from 0; None if no shot began.
-        success: True if the last image met the target; None if no image was judged after the last moves.
-        filling: Filling of the target on that image, 0 to 1; None likewise.
-        file: The shot's file on labseq's computer; None if it failed. It is written just after the answer.
-        images: The images of this shot since `go`, in order, as labseq describes them.
-        facts: All that labseq said, times in seconds after `go`.
+        is_ready: True if labseq finished its shot. False if it failed, so that the atoms may be lost.
+        is_refused: True if labseq refused the values of `go` and so has not touched the atoms.
+        reason: Why the shot failed, or "" if it is ready.
+        shot: Number of the shot in the run, from 0. None if no shot began.
+        success: True if the last image met the target. None if no image was judged after the last moves.
+        filling: Filling of the target on that image, 0 to 1. None if no image was judged.
+        file: The shot's file on labseq's computer, written just after the answer. None if the shot failed.
+        images: The images of this shot since `go`, in order.
+        facts: Everything that labseq sent, with times in seconds after `go`.
     """
 
     def __init__(self, facts: dict[str, Any]) -> None:
@@ -98,10 +98,10 @@ class Answer:
         return self.occupancy(-1)
 
     def occupancy(self, image: int | str) -> Any:
-        """Which sites hold an atom.
+        """The sites with atoms on an image.
 
         Args:
-            image: Number of the image from 0, from the end if negative; or its name.
+            image: Name of the image, or its number from 0 (from the end if negative).
 
         Returns:
             A list of rows of booleans, or a boolean array (n_rows, n_cols) if numpy is installed.
@@ -112,36 +112,36 @@ class Answer:
         if isinstance(image, str):
             named = [one for one in self.images if one["name"] == image]
             if not named:
-                raise LookupError(f"no image '{image}'; there are: {[one['name'] for one in self.images]}")
+                raise LookupError(f"no image '{image}'; expected {[one['name'] for one in self.images]}")
             chosen = named[0]
         else:
             chosen = self.images[image]
         return Image(chosen, tuple(self.facts["shape"])).occupancy
 
     def __repr__(self) -> str:
-        """The state, the shot, and what matters most."""
+        """The state, the shot and the main result."""
         what = f"filling={self.filling}" if self.is_ready else f"reason={self.reason!r}"
         return f"<{self.facts['answer']} shot={self.shot} {what}>"
 
 
 class Leader:
-    """A connection to labseq, for one thread; closes at the end of a `with` block.
+    """A connection to labseq, for one thread. Closes at the end of a `with` block.
 
     Args:
         host: Computer of labseq.
         port: The `port` of the device `tcp_leader`.
-        token: Text of the file `leader.token`; by default it is read from labseq's state folder on this
+        token: Text of the file `leader.token`. By default read from labseq's state folder on this
             computer.
-        timeout_s: Longest time for labseq to answer anything but the end of a shot, in seconds.
-        each_image: Have labseq tell each image as soon as it is known, for `on_image` of wait().
-        all_shots: Have labseq tell the end of shots that this connection did not start, too.
+        timeout_s: Longest time for labseq to answer, in seconds, except for the end of a shot.
+        each_image: Ask labseq to send each image as soon as it is known, for `on_image` of wait().
+        all_shots: Ask labseq to also report the end of shots that this connection did not start.
 
     Attributes:
-        deadline_s: Longest time from `go` to the end of the shot, as the profile sets it.
+        deadline_s: Longest time from `go` to the end of the shot, from the profile.
         shape: Rows and columns of the grid.
 
     Raises:
-        LabseqError: labseq refuses the connection: the token, another leader, another version.
+        LabseqError: labseq refuses the connection because of the token, another leader or the version.
         OSError: No labseq listens there, or it does not answer.
     """
 
@@ -173,16 +173,16 @@ class Leader:
         self.shape: tuple[int, int] = tuple(hello["shape"])
 
     def go(self, text: str = "", values: Mapping[str, Any] | None = None) -> None:
-        """Start a shot; returns as soon as labseq has accepted it.
+        """Start a shot, and return as soon as labseq has accepted it.
 
         Args:
             text: Stored with the shot.
-            values: Address -> value for this shot, as for `labseq run --set`: {"shot.hold.duration": "5 ms"}.
+            values: Address -> value for this shot as for `labseq run --set`, {"shot.hold.duration": "5 ms"}.
                 The sequence must allow the addresses in `leader: {may_set: [...]}`. labseq checks the values
-                when a step takes this `go`; it answers wait() with `is_refused` if one is wrong.
+                when a step takes this `go`. If a value is wrong, wait() returns `is_refused`.
 
         Raises:
-            LabseqError: labseq still takes the last shot, or text and values have more than 4,000 bytes.
+            LabseqError: labseq is still taking the last shot, or text and values have more than 4,000 bytes.
             RuntimeError: wait() has not been called for the last `go`.
             OSError: The connection is lost.
         """
@@ -197,14 +197,14 @@ class Leader:
     def set(self, values: Mapping[str, Any]) -> None:
         """Give values for the next shot, which `go` or an edge at the timing box starts.
 
-        labseq answers while no shot goes on.
+        labseq answers when no shot is in progress.
 
         Args:
             values: As for go().
 
         Raises:
-            LabseqError: A value is refused; the text says why.
-            OSError: The connection is lost, or a shot goes on for longer than `timeout_s`.
+            LabseqError: A value is refused. The text is the reason.
+            OSError: The connection is lost, or a shot continues for longer than `timeout_s`.
         """
         self._send(json.dumps({"set": dict(values)}))
         self._receive(("set",), self.timeout_s)
@@ -219,15 +219,15 @@ class Leader:
         """Wait for the end of the shot.
 
         Args:
-            timeout_s: Longest time between two messages of labseq; by default a second more than the
-                deadline, after which labseq answers in any case.
+            timeout_s: Longest time between two messages of labseq. Default a second more than the
+                deadline, at which labseq always answers.
             on_image: Called with each image, if the connection was made with `each_image`.
-            on_step: Called with the name of a step `leader: NAME`; does it, and returns when it is done.
-            on_light: Called with the exposure time in seconds: turns the imaging light on. Called with 0:
-                turns it off.
+            on_step: Called with the name of a step `leader: NAME`. Does the step, and returns at its end.
+            on_light: Called with the exposure time in seconds to turn the imaging light on, and with 0 to
+                turn it off.
 
         Raises:
-            RuntimeError: No `go` waits for its answer, or labseq asks for something that no function does.
+            RuntimeError: No `go` waits for its answer, or labseq asks for an action without a function.
             OSError: Nothing came in time (wait() may be called again), or the connection is lost. Treat the
                 atoms as not rearranged.
         """
@@ -265,12 +265,12 @@ class Leader:
         return self.wait()
 
     def state(self) -> str:
-        """What labseq does: "idle", "waiting" for `go`, or "busy"."""
+        """State of labseq, "idle", "waiting" for `go`, or "busy"."""
         self._send("state?")
         return self._receive(("state",), self.timeout_s)["state"]
 
     def close(self) -> None:
-        """Close the connection; a shot goes on without it."""
+        """Close the connection. A shot continues without it."""
         self._socket.close()
 
     def __enter__(self) -> Leader:
@@ -294,7 +294,7 @@ class Leader:
         self._socket.sendall(line.encode() + b"\n")
 
     def _receive(self, words: tuple[str, ...], timeout_s: float) -> dict[str, Any]:
-        """The next message that begins with one of these words; the end of a shot is kept for wait()."""
+        """The next message that begins with one of these words. The end of a shot is kept for wait()."""
         for message in self._early:
             if message["answer"] in words:
                 self._early.remove(message)
@@ -319,7 +319,7 @@ class Leader:
         text = line.decode()
         if text.startswith("{"):
             return json.loads(text)
-        word, _, reason = text.partition(" ")  # before it knows the form, labseq refuses in plain text
+        word, _, reason = text.partition(" ")  # before it knows the form, labseq refuses in words
         return {"answer": word, "reason": reason}
 
 
@@ -327,7 +327,7 @@ def own_token() -> str:
     """The token in labseq's state folder on this computer.
 
     Raises:
-        OSError: There is none, or this user cannot read it.
+        OSError: There is no token, or this user cannot read it.
     """
     if "LABSEQ_STATE" in os.environ:
         folder = Path(os.environ["LABSEQ_STATE"])

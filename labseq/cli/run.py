@@ -245,7 +245,7 @@ def copy_files(folder: Path) -> None:
     copies = list(_copies(folder))
     if taken := [new for _, new in copies if new.exists()]:
         more = f" (and {plural(len(taken) - 1, 'more file')})" if len(taken) > 1 else ""
-        what = f"nothing was copied, because this file already exists{more}"
+        what = f"this file already exists{more}, so nothing was copied"
         raise ConfigError(Problem(what, visible(str(taken[0])), expected="a folder without them"))
     for old, new in copies:
         try:

@@ -57,9 +57,7 @@ class KnownKeys:
         try:
             self._names = known_keys(keys_root())
         except Exception as error:  # noqa: BLE001 - whatever is wrong with them must not end the server
-            failure = (
-                f"the known keys cannot be read, so the previous keys stay valid: {format_error(error)}"
-            )
+            failure = f"the known keys cannot be read, so the previous keys stay valid: {format_error(error)}"
         if failure and failure != self._failure:
             self._report(failure)
         self._failure = failure

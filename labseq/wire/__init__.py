@@ -1,4 +1,4 @@
-"""Messages between computers: values, keys and sockets, for drivers of remote devices and their server."""
+"""Messages between computers, with their values, keys and sockets, for remote devices and their server."""
 
 from labseq.processes import is_loopback
 from labseq.wire.keys import find_keys, keys_root, known_keys, new_keys, read_public

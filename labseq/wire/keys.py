@@ -1,4 +1,4 @@
-"""The keys of this computer and of those that it knows: a file for each.
+"""The keys of this computer and of the computers that it knows, each in a file.
 
 The folder of keys contains ``NAME.key_secret``, the secret key of this computer, ``NAME.key``, its public
 key, which other computers need, and a folder ``known`` with the public keys of other computers.
@@ -33,7 +33,7 @@ class Keys:
 
 
 def keys_root() -> Path:
-    """Folder of keys: LABSEQ_KEYS, else ``keys`` in the user's folder of configurations."""
+    """Folder of keys. LABSEQ_KEYS, else ``keys`` in the user's configuration folder."""
     if folder := os.environ.get("LABSEQ_KEYS"):
         return Path(folder).expanduser()
     import platformdirs
@@ -48,7 +48,7 @@ def new_keys(name: str, folder: Path) -> tuple[Path, Path]:
         The files of the secret and of the public key.
 
     Raises:
-        ConfigError: The name cannot be that of a file, or such a key already exists.
+        ConfigError: The name cannot be a file name, or such a key already exists.
         RecordingError: The files cannot be written.
     """
     import zmq
@@ -79,18 +79,18 @@ def _content(public: bytes, secret: bytes = b"") -> bytes:
 
 
 def find_keys(folder: Path) -> Keys:
-    """The keys of this computer.
+    """Read the keys of this computer.
 
     Args:
         folder: The folder of keys.
 
     Raises:
-        ConfigError: There are none, or several; or the file is damaged.
+        ConfigError: There is no key, there are several, or the file is damaged.
     """
     files = sorted(folder.glob(f"*{SECRET}"))
     if len(files) != 1:
         problem = "there are several keys of this computer" if files else "this computer has no key"
-        hint = "keep one of them in this folder" if files else "'labseq keys new' makes one"
+        hint = "keep one of them in this folder" if files else "make one with 'labseq keys new'"
         raise ConfigError(Problem(problem, str(folder), hint=hint))
     keys = _read(files[0])
     if len(keys) != 2:
@@ -101,10 +101,10 @@ def find_keys(folder: Path) -> Keys:
 
 
 def read_public(path: Path) -> bytes:
-    """The public key in a file.
+    """Read the public key in a file.
 
     Raises:
-        ConfigError: It does not exist, or is damaged.
+        ConfigError: The file does not exist, or is damaged.
     """
     keys = _read(path)
     if b"public" not in keys:
@@ -113,10 +113,10 @@ def read_public(path: Path) -> bytes:
 
 
 def known_keys(folder: Path) -> dict[bytes, str]:
-    """The public keys of other computers -> their names; files that are unreadable or damaged are left out.
+    """The public keys of other computers -> their names, without unreadable or damaged files.
 
     Raises:
-        OSError: The folder cannot be read, which is not the same as an empty one.
+        OSError: The folder cannot be read, which is not the same as an empty folder.
         RecordingError: This process, or the computer, can open no more files.
     """
     names: list[str] = []
@@ -127,7 +127,7 @@ def known_keys(folder: Path) -> dict[bytes, str]:
         try:
             public = _values(path).get(b"public")
         except RecordingError as error:
-            # with no files left to open every key would seem withdrawn, and all clients would be cut off
+            # if no file can be opened, every key would seem withdrawn, and all clients would be cut off
             if getattr(error.__cause__, "errno", 0) in (errno.EMFILE, errno.ENFILE):
                 raise
             continue
@@ -147,6 +147,6 @@ def _read(path: Path) -> dict[bytes, bytes]:
 
 
 def _values(path: Path) -> dict[bytes, bytes]:
-    """The keys in a file, by "public" and "secret"; it has the format of ZeroMQ's certificates."""
+    """The keys "public" and "secret" in a file that has the format of ZeroMQ's certificates."""
     pattern = rb'^\s*(public|secret)-key = "([!#-~]{40})"\s*$'
     return dict(re.findall(pattern, read_file(path, 4096), re.MULTILINE))

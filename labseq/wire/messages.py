@@ -1,6 +1,6 @@
-"""Messages: a part of msgpack for the structure, a raw part for all small arrays, and one per large array.
+"""Messages, with a msgpack part for the structure, a raw part for small arrays, and one per large array.
 
-Nothing that arrives is executed: it can only become plain values, arrays of numbers, the types of
+Nothing that arrives is executed. It can only become plain values, arrays of numbers, the types of
 :data:`TYPES` and the errors of :mod:`labseq.errors`, whose own constructors check their values.
 """
 
@@ -30,17 +30,17 @@ Part: TypeAlias = bytes | memoryview
 MAX_HEADER: Final = 1 << 20
 """Largest first part, in bytes."""
 MAX_PART: Final = 1 << 26
-"""Largest part, in bytes: twice a frame of 4096 x 4096 pixels."""
+"""Largest part, in bytes, which is twice a frame of 4096 x 4096 pixels."""
 SMALL: Final = 1 << 14
 """Arrays of up to this many bytes share a part, because a part costs more than copying them."""
 ALIGNMENT: Final = 16
-"""Arrays in the shared part begin at multiples of this, in bytes."""
+"""Arrays in the shared part begin at multiples of this number of bytes."""
 MAX_PARTS: Final = 256
 MAX_MESSAGE: Final = 1 << 28
 """Largest sum of all parts, in bytes."""
 MAX_DEPTH: Final = 16
 MAX_SITES: Final = 1_000_000
-"""Most sites of all grids in a message, as many as a profile may have: a grid works out their positions."""
+"""Maximum number of sites of all grids in a message, as in a profile. A grid computes all positions."""
 
 _NUMBERS: Final = re.compile(r"[|<](?:b1|[iu][1248]|f[48])")
 _TEXT: Final = re.compile(r"(?:\|S|<U)[1-9]\d{0,3}")
@@ -74,7 +74,7 @@ class MessageError(ValueError):
 
 
 def pack(value: Any) -> list[Part]:
-    """The parts of a message.
+    """Convert a value to the parts of a message.
 
     Raises:
         MessageError: The value contains something that cannot be sent, or is too large.
@@ -108,7 +108,7 @@ def pack(value: Any) -> list[Part]:
     is_large = sizes[0] > MAX_HEADER or max(sizes) > MAX_PART or sum(sizes) > MAX_MESSAGE
     if is_large or len(parts) > MAX_PARTS:
         most = f"{MAX_PARTS} parts of {MAX_PART >> 20} MiB, {MAX_MESSAGE >> 20} MiB in all"
-        raise MessageError(f"it is too large to be sent: at most {most}")
+        raise MessageError(f"it is too large to be sent; the limit is {most}")
     return parts
 
 
@@ -116,7 +116,7 @@ def _add_array(array: NDArray[Any], arrays: list[Part], small: bytearray) -> lis
     """Add an array to the parts of a message.
 
     Returns:
-        Its place [index of the part, first byte], dtype, shape, and the descriptions of its columns.
+        The array's place [index of the part, first byte], dtype, shape, and descriptions of the columns.
     """
     dtype = array.dtype
     if not dtype.isnative or sys.byteorder == "big":
@@ -142,7 +142,7 @@ def _dtype_text(dtype: np.dtype[Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value to the nearest type that msgpack knows."""
+    """Convert a value to the closest type of msgpack."""
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, bool | np.bool_):
@@ -162,13 +162,13 @@ def _plain(value: Any) -> Any:
 
 
 def unpack(parts: Sequence[Part]) -> Any:
-    """The value that a message contains; its arrays are read-only and share the memory of the parts.
+    """Convert a message to its value. The arrays are read-only and share the memory of the parts.
 
-    Sizes and shapes are checked before anything is made of them. No byte belongs to two arrays, so all arrays
+    Sizes and shapes are checked before they are used. No byte belongs to two arrays, so all arrays
     together are no larger than the message.
 
     Raises:
-        MessageError: It is damaged, too large, or contains a value that messages cannot carry.
+        MessageError: The message is damaged, too large, or contains a value that messages cannot carry.
     """
     import msgpack
 
@@ -177,7 +177,7 @@ def unpack(parts: Sequence[Part]) -> Any:
     if (n_bytes := sum(map(len, parts))) > MAX_MESSAGE:
         raise MessageError(f"it has {n_bytes} bytes; expected at most {MAX_MESSAGE}")
     depth, n_sites = 0, 0
-    unused = [0] * len(parts)  # the first byte of each part that no array has had yet
+    unused = [0] * len(parts)  # the first byte of each part that no array has used yet
 
     def rebuild(code: int, data: bytes) -> Any:
         nonlocal depth, n_sites
@@ -197,10 +197,10 @@ def unpack(parts: Sequence[Part]) -> Any:
             return _object(cast("list[Any]", content))
         if code in (_TUPLE, _SET):
             return tuple(content) if code == _TUPLE else frozenset(content)
-        raise MessageError(f"it contains something of the unknown type {code}")
+        raise MessageError(f"it contains a value of the unknown type {code}")
 
     def inner(data: Part) -> Any:
-        # msgpack reserves memory for the length that a list announces, so first see that its items have come
+        # msgpack reserves memory for the length that a list announces, so first check that it has these items
         scanner = msgpack.Unpacker(read_size=len(data) + 1, max_buffer_size=MAX_HEADER + 1)
         scanner.feed(data)
         scanner.skip()
@@ -220,7 +220,7 @@ def unpack(parts: Sequence[Part]) -> Any:
 
 @contextmanager
 def _no_collections() -> Generator[None]:
-    """Context manager: no collection of garbage, which takes most of the time of a list of many lists."""
+    """Context manager without garbage collection, which takes most of the time for a list of many lists."""
     is_collecting = gc.isenabled()
     gc.disable()
     try:
@@ -257,7 +257,7 @@ def _array(parts: Sequence[Part], content: list[Any], unused: list[int]) -> NDAr
 
 
 def _data(parts: Sequence[Part], place: Any, n_bytes: int, unused: list[int]) -> memoryview:
-    """The bytes of an array, from their place as :func:`_add_array` gives it.
+    """The bytes of an array, from the place that :func:`_add_array` returned.
 
     Arrays that shared bytes would cost more memory than the message has, because unaligned ones are copied.
     """
@@ -277,7 +277,7 @@ def _checked_dtype(text: Any) -> np.dtype[Any]:
 
 
 def _count_sites(content: list[Any]) -> int:
-    """The number of sites of an object, as its fields give it; 0 if it is not a grid."""
+    """The number of sites according to an object's fields. 0 if it is not a grid."""
     name, values = content
     if name != SiteGrid.__name__:
         return 0
@@ -304,7 +304,7 @@ _ERRORS: Final = {
 
 
 def report_error(error: BaseException) -> dict[str, Any]:
-    """An error as a value for a message: its class, its text and its values."""
+    """An error as a value for a message, with its class, text and values."""
     kind = next((cls.__name__ for cls in type(error).__mro__ if _ERRORS.get(cls.__name__) is cls), "")
     if not kind:
         return {"class": "", "text": format_error(error), "values": {}}
@@ -317,17 +317,17 @@ def report_error(error: BaseException) -> dict[str, Any]:
 
 
 def error_of(report: Any, name: str, where: str) -> LabseqError:
-    """The error that was reported from another computer, as one of the same class.
+    """The error that another computer reported, as an object of the same class.
 
     Args:
-        report: What :func:`report_error` made of it.
-        name: What the profile of this computer calls the device.
+        report: The result of :func:`report_error`.
+        name: Name of the device in the profile of this computer.
         where: The address of the other computer, for the message.
     """
     try:
         kind, text, values = str(report["class"]), str(report["text"]), dict(report["values"])
     except (TypeError, KeyError, ValueError):
-        return DeviceError(name, f"an error that cannot be read came from {where}")
+        return DeviceError(name, f"an unreadable error came from {where}")
     cls = _ERRORS.get(kind)
     if cls is None:
         return DeviceError(name, f"{text} (at {where})")
@@ -335,7 +335,7 @@ def error_of(report: Any, name: str, where: str) -> LabseqError:
     if issubclass(cls, DeviceError | errors.TransientError) and {"device", "message"} <= values.keys():
         values["device"], values["message"] = name, f"{one_line(str(values['message']))} (at {where})"
         text = f"{name}: {values['message']}"
-    # not by its constructor, whose parameters differ from class to class
+    # not with its constructor, whose parameters differ from class to class
     rebuilt = cls.__new__(cls)
     rebuilt.args = (text,)
     rebuilt.__dict__.update(values)

@@ -1,4 +1,4 @@
-"""Sockets of ZeroMQ: encrypted by CURVE for known keys, without it on this computer only."""
+"""Sockets of ZeroMQ, encrypted by CURVE for known keys, or without encryption only on this computer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from labseq.wire.keys import Keys
 
 PROTOCOL: Final = 2
-"""Version of the messages; both computers need the same."""
+"""Version of the messages. Both computers need the same."""
 BEAT_S: Final = 0.15
 """Interval of the heartbeats of a connection, in seconds."""
 LOST_S: Final = 0.75
@@ -25,7 +25,7 @@ LOST_S: Final = 0.75
 HANDSHAKE_S: Final = 2.0
 """Longest time for a client to show its key, in seconds."""
 MAX_WAITING: Final = 4
-"""Messages of a connection that wait to be read: a client waits for each reply."""
+"""Messages of a connection that wait to be read. Few, because a client waits for each reply."""
 MAX_REPLIES: Final = 8
 """Replies to a connection that wait to be sent. A client that does not read loses further ones."""
 
@@ -63,12 +63,12 @@ def parse_address(address: str) -> tuple[str, int]:
 
 
 def client_socket(keys: Keys | None, server: bytes | None, timeout_s: float = -1e-3) -> zmq.Socket[Any]:
-    """A DEALER socket, not connected yet, that never reconnects: a broken connection ends the session.
+    """A DEALER socket, not connected yet. It never reconnects, because a broken connection ends the session.
 
     Args:
-        keys: The keys of this computer; None for a server on this computer.
-        server: The public key of the server; None for one on this computer.
-        timeout_s: Longest time to wait for a message, in seconds; by default without limit.
+        keys: The keys of this computer. None for a server on this computer.
+        server: The public key of the server. None for a server on this computer.
+        timeout_s: Longest time to wait for a message, in seconds. Default unlimited.
     """
     import zmq
 
@@ -92,7 +92,7 @@ def endpoint(host: str, port: int) -> str:
 
 
 def server_socket(context: zmq.Context[Any], address: str, keys: Keys | None) -> zmq.Socket[Any]:
-    """A ROUTER socket that listens at an address of this computer only, as ZeroMQ writes it."""
+    """A ROUTER socket that listens only at an address of this computer, in ZeroMQ's notation."""
     import zmq
 
     socket = context.socket(zmq.ROUTER)
@@ -100,8 +100,8 @@ def server_socket(context: zmq.Context[Any], address: str, keys: Keys | None) ->
     socket.set(zmq.HANDSHAKE_IVL, round(1e3 * HANDSHAKE_S))
     socket.set(zmq.RCVHWM, MAX_WAITING)
     socket.set(zmq.SNDHWM, MAX_REPLIES)
-    # A ROUTER that always has a message to read seldom looks which replies were sent, and would drop a reply
-    # to a client that reads all of them. With these options it looks before it gives up.
+    # A ROUTER that always has a message to read seldom checks which replies were sent, and would drop a reply
+    # to a client that reads all of them. With these options it checks before it gives up.
     socket.set(zmq.ROUTER_MANDATORY, 1)
     socket.set(zmq.SNDTIMEO, 1)
     if keys is not None:
@@ -112,18 +112,18 @@ def server_socket(context: zmq.Context[Any], address: str, keys: Keys | None) ->
 
 
 class Connections:
-    """The connections at a server's socket: when a client's process dies, its connection ends at once.
+    """The connections at a server's socket, which end as soon as the client's process dies.
 
-    The operating system reuses the number of a connection that has ended. So a connection is named by two
-    numbers: that one, and how many connections had it before.
+    The operating system reuses the number of an ended connection. So a connection is named by two
+    numbers, which are that number and how many connections had it before.
 
     Args:
-        socket: The socket, which listens; used in the thread of the socket.
+        socket: The listening socket. Used in the thread of the socket.
     """
 
     def __init__(self, socket: zmq.Socket[Any]) -> None:
         import zmq
-        from zmq.utils.monitor import recv_monitor_message  # now: later no file may be left to open
+        from zmq.utils.monitor import recv_monitor_message  # now, as later it may be impossible to open files
 
         self._receive_event = recv_monitor_message
         self._socket = socket
@@ -132,12 +132,12 @@ class Connections:
         self._ended: set[tuple[int, int]] = set()
 
     def named(self, number: int) -> tuple[int, int]:
-        """The connection that has a number now."""
+        """The connection that now has a number."""
         self._read()
         return number, self._n_before[number]
 
     def ended(self) -> set[tuple[int, int]]:
-        """Those that have ended since the last call."""
+        """The connections that have ended since the last call."""
         self._read()
         ended, self._ended = self._ended, set()
         return ended
@@ -154,7 +154,7 @@ class Connections:
                 self._n_before[number] += 1
 
     def close(self) -> None:
-        """Stop watching; call it before the socket is closed."""
+        """Stop watching. Call it before the socket is closed."""
         self._socket.disable_monitor()
         self._events.close()
 

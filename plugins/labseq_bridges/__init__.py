@@ -1,4 +1,4 @@
-"""Ends of labseq inside other control systems: ARTIQ, labscript, and anything that speaks ZeroMQ.
+"""Bridges to labseq inside other control systems, such as ARTIQ, labscript and anything with ZeroMQ.
 
-Copy this folder and labseq_client.py to the computer of the control system; labseq need not be there.
+Copy this folder and labseq_client.py to the computer of the control system, which does not need labseq.
 """

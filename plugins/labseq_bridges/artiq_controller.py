@@ -1,6 +1,6 @@
-"""An ARTIQ controller of labseq: `python -m labseq_bridges.artiq_controller -p 5751`.
+"""An ARTIQ controller of labseq, started by `python -m labseq_bridges.artiq_controller -p 5751`.
 
-It needs sipyco, which comes with ARTIQ. An entry of `device_db.py`, for this controller on the computer of
+It needs sipyco, which comes with ARTIQ. Entry of `device_db.py`, for a controller on the computer of
 the ARTIQ master:
 
     "labseq": {
@@ -10,8 +10,8 @@ the ARTIQ master:
         "command": "python -m labseq_bridges.artiq_controller -p {port} --bind {bind}",
     },
 
-sipyco knows no passwords, and evaluates calls as Python. Whoever can connect to its port can start shots and
-run programs with your rights.
+sipyco knows no passwords, and evaluates calls as Python. Anyone who can connect to its port can start shots
+and run programs with your rights.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ class Labseq:
         self._link = link
 
     def ping(self) -> bool:
-        """Answer the controller manager, which restarts a controller that does not answer; always True."""
+        """Answer the controller manager, which restarts a controller that does not answer. Always True."""
         return True
 
     def go(self, text: str = "", values: dict[str, Any] | None = None) -> None:
-        """Start a shot; returns as soon as labseq has accepted it. See ``labseq_client.Leader.go``."""
+        """Start a shot, and return as soon as labseq has accepted it. See ``labseq_client.Leader.go``."""
         self._link.go(text, values)
 
     async def wait(self) -> dict[str, Any]:
-        """Wait for the end of the shot: `is_ready`, `reason`, `filling`, `before`, `after` and more."""
+        """Wait for the shot's end, and get `is_ready`, `reason`, `filling`, `before`, `after` and more."""
         while True:
             answer = self._link.wait(SLICE_S)
             if answer is not None:
@@ -54,7 +54,7 @@ class Labseq:
         """The atoms on an image of the last shot, as rows of 0 and 1.
 
         Args:
-            image: Number of the image from 0, from the end if negative; or its name.
+            image: Name of the image, or its number from 0 (from the end if negative).
 
         Raises:
             RuntimeError: The last shot has not ended.
@@ -66,16 +66,16 @@ class Labseq:
         return rows(answer.occupancy(image))
 
     def abort(self) -> dict[str, Any]:
-        """End the shot before it next moves atoms, and wait for its end; see ``wait``."""
+        """End the shot before it next moves atoms, and wait for its end, as in ``wait``."""
         return plain(self._link.abort())
 
     def state(self) -> str:
-        """What labseq does: "idle", "waiting" for `go`, or "busy"."""
+        """State of labseq, "idle", "waiting" for `go`, or "busy"."""
         return self._link.state()
 
 
 async def serve(target: Labseq, hosts: Any, port: int) -> None:
-    """Serve until a client calls `terminate`, as the controller manager does."""
+    """Serve until a client such as the controller manager calls `terminate`."""
     from sipyco.pc_rpc import Server  # pyright: ignore[reportMissingImports] - it is not on PyPI
 
     # in parallel, so that a dashboard can abort the shot for which an experiment waits

@@ -1,6 +1,6 @@
-"""An example for the repository of ARTIQ: a kernel that does its science only if enough atoms are in place.
+"""Example for an ARTIQ repository, with a kernel that does its science only if enough atoms are in place.
 
-The controller of `artiq_controller.py` is `labseq` in `device_db.py`; `ttl_science` stands for the science.
+The controller of `artiq_controller.py` is `labseq` in `device_db.py`. `ttl_science` represents the science.
 """
 
 from artiq.experiment import EnvExperiment, TInt32, TList, delay, kernel, ms
@@ -24,14 +24,14 @@ class Rearranged(EnvExperiment):
         self.n_atoms = [0 for _ in range(self.n_shots)]
 
     def rearrange(self, number: TInt32) -> TList(TInt32):
-        """Let labseq rearrange, on the host: 1 for each site of the grid with an atom; empty if it failed."""
+        """Let labseq rearrange, on the host. Returns 1 for each site with an atom, or [] on failure."""
         self.labseq.go(f"artiq {number}")
         answer = self.labseq.wait()
         return [atom for row in answer["after"] for atom in row] if answer["is_ready"] else []
 
     @kernel
     def run(self):
-        """Take the shots; the atoms wait in their tweezers while labseq answers."""
+        """Take the shots. The atoms wait in their tweezers while labseq answers."""
         self.core.reset()
         for number in range(self.n_shots):
             # load the atoms here
@@ -47,13 +47,13 @@ class Rearranged(EnvExperiment):
 
     @kernel
     def science(self):
-        """What the atoms are for."""
+        """Do the science with the atoms."""
         self.ttl_science.on()
         delay(1 * ms)
         self.ttl_science.off()
         self.n_science += 1
 
     def analyze(self):
-        """Keep what the kernel saw."""
+        """Save the kernel's results."""
         self.set_dataset("n_atoms", self.n_atoms)
         self.set_dataset("n_science", self.n_science)

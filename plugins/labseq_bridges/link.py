@@ -1,4 +1,4 @@
-"""A connection to labseq that is made when it is needed, and made again after a run has ended."""
+"""A connection to labseq that is made when needed, and again after a run has ended."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from labseq_client import Answer, Leader, own_token
 
 
 class Link:
-    """Leads the run that waits for `go` now; for one thread.
+    """Leads the run that now waits for `go`. For one thread.
 
     Args:
         host: Computer of labseq.
         port: The `port` of the device `tcp_leader`.
-        token: Copy of the file `leader.token`; by default the file in labseq's state folder on this computer.
+        token: Copy of the file `leader.token`. Default the file in labseq's state folder on this computer.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 5750, token: Path | None = None) -> None:
@@ -27,21 +27,21 @@ class Link:
         self._due_s = 0.0
 
     def go(self, text: str = "", values: dict[str, Any] | None = None) -> None:
-        """Start a shot; returns as soon as labseq has accepted it.
+        """Start a shot, and return as soon as labseq has accepted it.
 
         Args:
             text: Stored with the shot.
-            values: Address -> value for this shot, as `Leader.go` takes them.
+            values: Address -> value for this shot, as in `Leader.go`.
 
         Raises:
-            LabseqError: labseq refuses it, with its reason. A wrong value is an answer of wait() instead.
-            RuntimeError: The last shot has not been waited for.
+            LabseqError: labseq refuses the shot, with a reason. wait() reports a wrong value instead.
+            RuntimeError: wait() was not called for the last shot.
             OSError: No run waits there, or the connection is lost.
         """
         if self._leader is not None:
             try:
                 self._leader.go(text, values)
-            except ConnectionError:  # that run has ended; another one may wait
+            except ConnectionError:  # that run has ended, but another one may wait
                 self.close()
         if self._leader is None:
             self._connect().go(text, values)
@@ -49,13 +49,13 @@ class Link:
         self._due_s = time.monotonic() + self._led().deadline_s + 1.0
 
     def wait(self, timeout_s: float | None = None) -> Answer | None:
-        """Wait for the end of the shot; once it has ended, its answer again.
+        """Wait for the end of the shot. After the end, return the same answer again.
 
         Args:
-            timeout_s: Longest time; by default a second more than the deadline of labseq.
+            timeout_s: Longest time. Default a second more than labseq's deadline.
 
         Returns:
-            The answer; None if the shot has not ended within `timeout_s`.
+            The answer. None if the shot has not ended within `timeout_s`.
 
         Raises:
             RuntimeError: No shot was started.
@@ -68,7 +68,7 @@ class Link:
             try:
                 self._answer = leader.wait(max(0.001, limit_s))
             except OSError as error:
-                # socket.timeout is no TimeoutError before Python 3.10
+                # socket.timeout is not a TimeoutError before Python 3.10
                 if not isinstance(error, socket.timeout) or time.monotonic() > self._due_s:
                     self.close()
                     raise
@@ -91,7 +91,7 @@ class Link:
         return self._answer
 
     def state(self) -> str:
-        """What labseq does: "idle", "waiting" for `go`, or "busy".
+        """State of labseq, "idle", "waiting" for `go`, or "busy".
 
         Raises:
             LabseqError: labseq refuses the connection.
@@ -104,7 +104,7 @@ class Link:
             return self._connect().state()
 
     def close(self) -> None:
-        """Disconnect; a shot goes on."""
+        """Disconnect. A shot continues."""
         if self._leader is not None:
             self._leader.close()
         self._leader = None
@@ -118,7 +118,7 @@ class Link:
         """The token of labseq.
 
         Raises:
-            OSError: Its file is missing, or this user cannot read it.
+            OSError: The token's file is missing, or this user cannot read it.
         """
         return own_token() if self._token is None else self._token.read_text().strip()
 
@@ -128,9 +128,9 @@ class Link:
 
 
 def plain(answer: Answer) -> dict[str, Any]:
-    """What an answer tells, in numbers, texts and lists; occupancies as rows of 0 and 1.
+    """The content of an answer in numbers, texts and lists, with occupancies as rows of 0 and 1.
 
-    The keys are those of labseq's answer, and `is_ready`, `is_refused`, `file`, `before` and `after` of its
+    The keys are as in labseq's answer, and `is_ready`, `is_refused`, `file`, `before` and `after` of its
     `Answer`. The last two are missing if there is no image.
     """
     told = {**answer.facts, "is_ready": answer.is_ready, "is_refused": answer.is_refused, "file": answer.file}
@@ -145,14 +145,14 @@ def rows(occupancy: Any) -> list[list[int]]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say where labseq is."""
+    """Add the options for labseq's address and token."""
     group = parser.add_argument_group("labseq")
     group.add_argument("--labseq-host", default="127.0.0.1", help="computer of labseq (default: this one)")
     group.add_argument("--labseq-port", type=int, default=5750, help="port of its device tcp_leader (5750)")
-    about = "copy of its file leader.token (default: the file of this user on this computer)"
+    about = "copy of its file leader.token (default: this user's own file on this computer)"
     group.add_argument("--labseq-token", type=Path, metavar="FILE", help=about)
 
 
 def link_of(arguments: argparse.Namespace) -> Link:
-    """The connection that the options describe."""
+    """The connection for the parsed options."""
     return Link(arguments.labseq_host, arguments.labseq_port, arguments.labseq_token)

@@ -1,6 +1,6 @@
-"""A ZeroMQ socket (REP) of labseq: `python -m labseq_bridges.zeromq_server`. It needs pyzmq.
+"""A ZeroMQ socket (REP) of labseq, started by `python -m labseq_bridges.zeromq_server`. It needs pyzmq.
 
-A peer connects with ZeroMQ's mechanism PLAIN; the user name is `labseq`, the password the token. libzmq
+A peer connects with ZeroMQ's mechanism PLAIN. The user name is `labseq` and the password is the token. libzmq
 refuses any other peer before it keeps a message. Each request is a JSON object and gets one answer:
 
     {"request": "go", "text": "run 17", "values": {"planner.degree_of_parallelism": 5}}
@@ -8,9 +8,9 @@ refuses any other peer before it keeps a message. Each request is a JSON object 
     {"request": "abort"}
     {"request": "state"}
 
-`go` is answered {"answer": "busy"}, `wait` and `abort` with what labseq says of the shot. If the shot has not
-ended within `timeout_s`, `wait` is answered "busy", so that another request can come in between. A request
-that is refused is answered {"answer": "error", "reason": "..."}.
+`go` is answered {"answer": "busy"}, `wait` and `abort` with the result of the shot. If the shot has not
+ended within `timeout_s`, `wait` is answered "busy", so that another request can come in between. A
+refused request is answered {"answer": "error", "reason": "..."}.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from labseq_client import LabseqError
 from labseq_bridges.link import Link, add_arguments, link_of, plain
 
 LONGEST = 65536
-"""Longest request in bytes; ZeroMQ disconnects a peer that sends more."""
+"""Longest request in bytes. ZeroMQ disconnects a peer that sends more."""
 HANDSHAKE_MS = 2000
 """Longest time until a peer has shown the token, in milliseconds."""
 MAX_WAIT_S = 3600.0
@@ -36,7 +36,7 @@ KEYS: dict[str, set[str]] = {"go": {"text", "values"}, "wait": {"timeout_s"}, "a
 
 
 class RequestError(Exception):
-    """A request that labseq is not asked; the text is the reason."""
+    """A request that is not passed on to labseq. The text is the reason."""
 
 
 def answer_to(message: bytes, link: Link) -> dict[str, Any]:
@@ -77,7 +77,7 @@ def _asked(request: dict[str, Any], link: Link) -> dict[str, Any]:
 
 def _values(given: Any) -> dict[str, Any]:
     if not isinstance(given, dict):
-        raise RequestError("values must be an object: address -> value")
+        raise RequestError("values must be an object of address -> value")
     return given
 
 
@@ -92,7 +92,7 @@ def _timeout_s(given: Any) -> float | None:
 def serve(socket: Any, link: Link) -> None:
     """Answer requests one after the other, until an exception such as KeyboardInterrupt."""
     while True:
-        if not socket.poll(200):  # Ctrl-C does not end a call that has just begun to receive
+        if not socket.poll(200):  # because Ctrl-C does not end a call that has just begun to receive
             continue
         parts = socket.recv_multipart()
         socket.send(json.dumps(answer_to(b"".join(parts), link)).encode())
@@ -126,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             guard.configure_plain(passwords={"labseq": link.token()})
             socket.bind(f"tcp://{options.bind}:{options.port}")
         except (OSError, zmq.ZMQError) as error:
-            parser.error(f"{error}; see --labseq-token, --bind and --port")
+            parser.error(f"{error}; check --labseq-token, --bind and --port")
         address = socket.getsockopt_string(zmq.LAST_ENDPOINT)
         sys.stdout.write(f"listening on {address}\n")
         sys.stdout.flush()

@@ -7,7 +7,7 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the step and the devices of an external control system; in a dry run it is simulated."""
+    """Offer the step and devices for an external control system, which a dry run simulates."""
     steps = "labseq_follow.steps"
     registry.step("leader", f"{steps}:LeaderStep", f"{steps}:LeaderStepSettings")
     for kind, settings in (("tcp_leader", "TcpLeaderSettings"), ("serial_leader", "SerialLeaderSettings")):

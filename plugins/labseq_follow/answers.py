@@ -1,4 +1,4 @@
-"""What an answer tells a control system, in each form of the protocol."""
+"""The content of an answer to a control system, in each form of the protocol."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from labseq.plugin.messages import visible
 VERSION: Final = 3
 """Version of the protocol."""
 SHORT_LINE: Final = 200
-"""Longest first line in bytes of a control system, and longest answer of the short form."""
+"""Longest first line of a control system, and longest answer of the short form, in bytes."""
 LONGEST_REASON: Final = 1000
 _ENCODER: Final = json.JSONEncoder(allow_nan=False)
 
 
 class Form(Enum):
-    """What a control system asks for in its `hello`."""
+    """Form of the answers."""
 
     SHORT = "short"
-    """Lines of version 2, for one that names no version."""
+    """Lines of version 2, for a control system that names no version."""
     TEXT = "text"
     JSON = "json"
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What a control system asks for in its `hello`.
+    """The options that a control system requests in its `hello`.
 
     Attributes:
         form: Form of the answers.
-        each_image: Whether it wants an answer for each image.
-        listens: Whether it wants the answers of shots that it did not start, too.
+        each_image: Whether the control system wants an answer for each image.
+        listens: Whether it also wants answers for shots that it did not start.
     """
 
     form: Form = Form.SHORT
@@ -51,14 +51,14 @@ CHOICES_OF_HELLO: Final = {
     "images": ("last", "each"),
     "shots": ("own", "all"),
 }
-"""What a `hello` may ask for -> its values, the default first."""
+"""Options of a `hello` -> their values, the default first."""
 
 
 def asked_for(words: str) -> Asked:
-    """What the words after `hello`, and after the token, ask for.
+    """Read the options after `hello` and the token.
 
     Raises:
-        ValueError: Another version, or a word that is not known; says what was expected.
+        ValueError: Another version, or an unknown word.
     """
     asked: dict[str, str] = {}
     for word in words.split():
@@ -83,12 +83,12 @@ def asked_for(words: str) -> Asked:
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """Times of a `go`, on the session's clock, in seconds.
+    """Times of a `go` and its shot on the session's clock, in seconds.
 
     Attributes:
-        go_s: It came.
-        taken_s: A step has taken it.
-        done_s: Its shot is over.
+        go_s: Time when `go` came.
+        taken_s: Time when a step took it.
+        done_s: Time when its shot was over.
     """
 
     go_s: float
@@ -97,11 +97,11 @@ class Times:
 
 
 def facts_of(about: Mapping[str, Any], times: Times) -> dict[str, Any]:
-    """The facts of a shot that an answer gives, ready for JSON; times are in seconds after `go`.
+    """The facts of a shot for its answer, ready for JSON. Times are in seconds after `go`.
 
     Args:
-        about: As ``labseq.plugin.LeaderLink.report`` receives it.
-        times: Those of the `go`. Only images, steps and stages that began after it was taken are given.
+        about: Facts as in ``labseq.plugin.LeaderLink.report``.
+        times: Times of the `go`. Only images, steps and stages that began after it was taken are included.
     """
     facts = {key: about[key] for key in ("shot", "success", "filling") if key in about}
     facts |= {"taken_s": _time(times.taken_s - times.go_s), "done_s": _time(times.done_s - times.go_s)}
@@ -152,7 +152,7 @@ def image_facts(image: ImageRecord, target: TargetPattern, since_s: float) -> di
 
 
 def bits(occupancy: Occupancy) -> str:
-    """An occupancy as hexadecimal digits: a bit for each site, row by row, 1 where there is an atom.
+    """An occupancy as hexadecimal digits, with a bit for each site, row by row, 1 for an atom.
 
     The first site is the highest bit of the first digit. Rows follow one another without a gap, and zeros
     fill the last byte.
@@ -166,9 +166,9 @@ def bits(occupancy: Occupancy) -> str:
 
 
 def line(form: Form, word: str, facts: Mapping[str, Any]) -> str:
-    """A line to send: the word that says what it is, and its facts.
+    """A line to send, with its first word and its facts.
 
-    In text, facts follow as "key=value" in their order; "run" and "reason" come last, and may contain spaces.
+    In text, facts follow as "key=value" in order. "run" and "reason" come last and may contain spaces.
     """
     if form is Form.JSON:
         return _ENCODER.encode({"answer": word, **facts})
@@ -181,7 +181,7 @@ def line(form: Form, word: str, facts: Mapping[str, Any]) -> str:
 
 
 def _flat(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """The facts of a line of text: of the images, the first and the last, and which were judged."""
+    """The facts of a line of text. Of the images it has the first, the last and which were judged."""
     flat = {key: value for key, value in facts.items() if not isinstance(value, list) and value is not None}
     last = {key: flat.pop(key) for key in ("occupancy", "file", "run", "reason") if key in flat}
     if images := facts.get("images"):
@@ -197,7 +197,7 @@ def _shown(value: bool | int | float | str) -> str:
 
 
 def one_line(text: str) -> str:
-    """A text without line feeds and other characters that cannot be seen."""
+    """A text without line feeds and other invisible characters."""
     return " ".join(visible(text).split())
 
 

@@ -1,4 +1,4 @@
-"""The device that connects an external control system: it starts the shots, labseq follows."""
+"""The device for an external control system that starts the shots while labseq follows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from labseq_follow.settings import SIMULATED, LinkSettings, SerialLeaderSettings
 from labseq_follow.tcp import TcpLink
 
 LOADING_S: Final = 0.25
-"""How long atoms load in a simulated lab with a real control system: five times the simulation's own time."""
+"""Loading time in a simulated lab with a real control system, five times the simulation's own time."""
 VALUES: Final = ("state", "is_connected")
 
 
@@ -44,11 +44,11 @@ def serial_leader(settings: SerialLeaderSettings, context: Context) -> LeaderDev
 class LeaderDevice(Device):
     """Receives the start signal `go`, and answers with the result.
 
-    Implements ``labseq.plugin.LeaderDialogue``. A thread receives, and keeps the deadline while a shot goes
-    on. The device has no commands; its values are ``state`` ("idle", "waiting", "busy") and ``is_connected``.
+    Implements ``labseq.plugin.LeaderDialogue``. A thread receives, and keeps the deadline of a shot.
+    The device has no commands. Its values are ``state`` ("idle", "waiting", "busy") and ``is_connected``.
 
     Args:
-        settings: Deadline, and what a simulated lab does.
+        settings: Deadline, and options for a simulated lab.
         context: Name, clock and simulation.
         link: The connection to a real control system.
 
@@ -56,11 +56,11 @@ class LeaderDevice(Device):
         ConfigError: The settings load atoms, but no lab is simulated.
     """
 
-    any_thread = True  # asked for an abort between a frame and its moves, where another thread costs 0.1 ms
+    any_thread = True  # an abort is checked between a frame and its moves, where another thread costs 0.1 ms
 
     def __init__(self, settings: LinkSettings, context: Context, link: Link) -> None:
         if settings.loads and context.simulation is None:
-            raise ConfigError("'loads' is for a simulated lab, and this one is real; remove it")
+            raise ConfigError("'loads' is for a simulated lab, but this lab is real; remove it")
         self._settings = settings
         self._context = context
         self._name = context.name or "leader"
@@ -81,7 +81,7 @@ class LeaderDevice(Device):
 
     @property
     def asks_for_light(self) -> bool:
-        """Whether the control system switches the imaging light when labseq asks for it."""
+        """Whether labseq asks the control system to switch the imaging light."""
         return self._settings.light == "asked"
 
     @property
@@ -106,7 +106,7 @@ class LeaderDevice(Device):
         self._is_open = True
 
     def close(self) -> None:
-        """Answer a `go` that waits for an answer, and disconnect; legal in any state."""
+        """Answer a pending `go`, and disconnect. Legal in any state."""
         if not self._is_open:
             return
         self._is_open = False
@@ -119,17 +119,17 @@ class LeaderDevice(Device):
         self._link.close()
 
     def safe_state(self) -> None:
-        """Nothing to do: it switches nothing, and the answer is sent when all devices are safe."""
+        """Do nothing, because it switches nothing, and the answer is sent when all devices are safe."""
 
     def check_command(self, name: str, **arguments: Any) -> None:
-        """Refuse: it has no commands.
+        """Refuse every command, because it has none.
 
         Raises:
             DeviceError: Always.
         """
         del arguments
         hint = f"a step `wait: {{for: {GO}, timeout: 10 s}}` waits for the start signal"
-        raise DeviceError(self._name, f"unknown command '{name}'; it has none: {hint}")
+        raise DeviceError(self._name, f"unknown command '{name}'; the device has none, but {hint}")
 
     command = check_command
 
@@ -145,11 +145,11 @@ class LeaderDevice(Device):
         return self._dialogue.state if name == "state" else self._dialogue.is_connected
 
     def wait_for(self, signal: str, timeout_s: float) -> str:
-        """Wait for `go`, which the thread that received it has answered; see ``labseq.plugin.LeaderLink``.
+        """Wait for `go`, which the receiving thread has answered, see ``labseq.plugin.LeaderLink``.
 
         Raises:
             DeviceError: Not open, or another signal.
-            DeviceTimeoutError: It did not come in time.
+            DeviceTimeoutError: `go` did not come in time.
             StopRequested: The operator asked the run to stop.
         """
         self._check_open()
@@ -164,7 +164,7 @@ class LeaderDevice(Device):
         if text is None:
             what = f"no '{GO}' within {format_quantity(timeout_s, 'time')} on {self._link.address}"
             connected = "the" if self._dialogue.is_connected else "no"
-            text = f"{what}; {connected} leader has connected; see 'timeout' of the wait"
+            text = f"{what}, and {connected} leader has connected; see 'timeout' of the wait"
             raise DeviceTimeoutError(self._name, text, timeout_s)
         if self._settings.loads and not simulated:
             load_atoms(self._context, LOADING_S)
@@ -174,27 +174,27 @@ class LeaderDevice(Device):
         """End the shot if the control system has aborted it.
 
         Raises:
-            ShotAbortedError: It has.
+            ShotAbortedError: The control system has aborted the shot.
         """
         if self._dialogue.is_aborted:
             raise ShotAbortedError("the leader aborted the shot", self._name)
         self._await_dark()
 
     def expect_values(self, check: Callable[[Mapping[str, str]], object]) -> None:
-        """Check the values of `set` by this function; see ``labseq.plugin.LeaderDialogue``."""
+        """Check the values of `set` with this function, see ``labseq.plugin.LeaderDialogue``."""
         self._check = check
 
     def take_values(self) -> Mapping[str, str]:
-        """The values that were sent for the shot that begins; see ``labseq.plugin.LeaderDialogue``."""
+        """The values that were sent for the shot that begins, see ``labseq.plugin.LeaderDialogue``."""
         with self._changed:
             self._is_in_shot = True
             return self._dialogue.take_values()
 
     def take_turn(self, step: str, timeout_s: float, shot: int) -> str:
-        """Let the control system do a step of its own; see ``labseq.plugin.LeaderDialogue``.
+        """Let the control system do a step of its own, see ``labseq.plugin.LeaderDialogue``.
 
         Raises:
-            TransientError: None is connected, it left or aborted the shot, or it was not done in time.
+            TransientError: No control system is connected, or it left, aborted the shot, or was too slow.
         """
         self._request("your", {"step": step, "shot": shot, "timeout_s": timeout_s}, "done", timeout_s)
         try:
@@ -205,32 +205,32 @@ class LeaderDevice(Device):
         return self._dialogue.reply
 
     def light_on(self, exposure_s: float, shot: int) -> None:
-        """Have the control system turn the imaging light on; see ``labseq.plugin.LeaderDialogue``.
+        """Ask the control system to turn the imaging light on, see ``labseq.plugin.LeaderDialogue``.
 
         Raises:
-            TransientError: As for a step.
+            TransientError: As in :meth:`take_turn`.
         """
         limit_s = self._settings.light_timeout
         self._request("light", {"exposure_s": exposure_s, "shot": shot}, "lit", limit_s)
         self._await_reply("its imaging light is not on", limit_s)
 
     def light_off(self, shot: int) -> None:
-        """Have it turn the light off; ``check_interlocks`` waits until it has.
+        """Ask it to turn the light off. ``check_interlocks`` waits until the light is off.
 
         Raises:
-            TransientError: None is connected.
+            TransientError: No control system is connected.
         """
-        if self._dialogue.awaited != UNANSWERED:  # else it left before the light was on
+        if self._dialogue.awaited != UNANSWERED:  # otherwise it left before the light was on
             self._request("dark", {"shot": shot}, "dark", self._settings.light_timeout)
 
     def report_image(self, about: About) -> None:
-        """Tell an image, if the control system wants each."""
+        """Send an image, if the control system wants each image."""
         with self._changed:
             if lines := self._dialogue.image(about):
                 self._send(lines)
 
     def report(self, state: str, about: About) -> str:
-        """Answer a `go`; see ``labseq.plugin.LeaderLink``.
+        """Answer a `go`, see ``labseq.plugin.LeaderLink``.
 
         Raises:
             DeviceError: Not open.
@@ -291,7 +291,7 @@ class LeaderDevice(Device):
         self._changed.notify_all()
 
     def _check_set(self) -> None:
-        """Check the values of a `set`; not during a shot, which this would delay by milliseconds."""
+        """Check the values of a `set`, but not during a shot, which this would delay by milliseconds."""
         values = self._dialogue.unchecked
         if values is None or self._check is None or self._is_in_shot:
             return
@@ -301,11 +301,11 @@ class LeaderDevice(Device):
         except LabseqError as error:
             reason = str(error)
         with self._changed:
-            if self._dialogue.unchecked is values:  # else a shot has begun with them meanwhile
+            if self._dialogue.unchecked is values:  # otherwise a shot has begun with them in the meantime
                 self._send(self._dialogue.check_set(reason))
 
     def _request(self, word: str, facts: About, reply: str, longest_s: float) -> None:
-        """Ask the control system for something that it replies to."""
+        """Send the control system a request that requires a reply."""
         self._check_open()
         if reply != "dark":
             self._await_dark()
@@ -322,7 +322,7 @@ class LeaderDevice(Device):
             self._await_reply("its imaging light may be on", self._settings.light_timeout)
 
     def _await_reply(self, otherwise: str, timeout_s: float) -> None:
-        """Wait for the reply that was asked for."""
+        """Wait for the requested reply."""
         why_not = wait_for(self._replied, timeout_s, self._context.clock)
         if why_not is None:
             why_not = f"the leader has not answered within {format_quantity(timeout_s, 'time')}"
@@ -330,15 +330,15 @@ class LeaderDevice(Device):
             raise self._unanswered(f"{otherwise}: {why_not}")
 
     def _unanswered(self, text: str) -> TransientError:
-        """The error for a leader that does not do its part: the machine has not failed, and the run goes on.
+        """The error for a leader that does not do its part. The machine is fine, so the run continues.
 
-        A shot that a leader began is repeated at its next `go`; any other one as its policy says.
+        A shot that a leader began is repeated at its next `go`. Any other shot follows its policy.
         """
         kind = ShotAbortedError if self._dialogue.state == "busy" else TransientError
         return kind(text, self._name)
 
     def _replied(self, longest_s: float) -> str | None:
-        """Why the reply will not come; "" if it has come, None if it may still come."""
+        """Why the reply will not come, "" if it has come, or None if it may still come."""
         with self._changed:
             if not self._dialogue.awaited:
                 return ""
@@ -360,9 +360,9 @@ class LeaderDevice(Device):
             return text
 
     def _send(self, lines: Sequence[str]) -> bool:
-        """Send lines; returns whether the control system received them.
+        """Send lines. Returns whether the control system received them.
 
-        What answers the next `go` is said first, because the control system may send it at once.
+        The answer to the next `go` is set first, because the control system may send `go` at once.
         """
         self._link.expect(encoded(answer) if (answer := self._dialogue.next_answer) else b"")
         try:

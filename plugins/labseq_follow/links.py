@@ -1,4 +1,4 @@
-"""What a connection to an external control system is; a serial line, and a simulated one."""
+"""Connections to an external control system, including a serial line and a simulated connection."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from labseq_follow.protocol import encoded
 from labseq_follow.settings import SerialLeaderSettings
 
 SLICE_S: Final = 0.02
-"""Longest wait for something to come: how soon a deadline and the end are noticed."""
+"""Longest wait for bytes, in seconds, after which a deadline and the end are noticed."""
 SEND_S: Final = 5.0
-"""Longest time to send a line on a serial port; 5,000 bytes take 0.45 s at 115,200 bits per second."""
+"""Longest time to send a line on a serial port. 5,000 bytes take 0.45 s at 115,200 bits per second."""
 REOPEN_S: Final = 0.5
 """Time between two attempts to open a port that was unplugged."""
 
@@ -28,16 +28,16 @@ Event: TypeAlias = (
     | tuple[Literal["lost"], str]
     | tuple[Literal["note"], str]
 )
-"""Who connected, and what it asks for; bytes; why the connection was lost; a note for the log."""
+"""A peer and its options, received bytes, the reason of a lost connection, or a note for the log."""
 
 
 class Link:
     """A connection on which one control system at a time may come and go.
 
     Attributes:
-        address: Where it finds labseq.
-        listens: Whether ``poll`` must be called to notice what happens.
-        token_file: The file with the token that a control system must know; None if it needs none.
+        address: Address where the control system finds labseq.
+        listens: Whether ``poll`` must be called to notice events.
+        token_file: The file with the token that a control system must know. None if it needs no token.
     """
 
     address = ""
@@ -52,7 +52,7 @@ class Link:
         return time.monotonic()
 
     def arrange_go(self, timeout_s: float) -> bytes:
-        """Called when a step begins to wait for `go`; returns bytes that come as a consequence.
+        """Called when a step begins to wait for `go`. Returns bytes that come as a consequence.
 
         Raises:
             DeviceTimeoutError: `go` will not come in time.
@@ -61,30 +61,30 @@ class Link:
         return b""
 
     def arrange_reply(self, reply: str, timeout_s: float) -> bytes:
-        """Called when labseq has asked for a reply; returns bytes that come as a consequence."""
+        """Called when labseq has asked for a reply. Returns bytes that come as a consequence."""
         del reply, timeout_s
         return b""
 
     def poll(self) -> list[Event]:
-        """Wait for at most :data:`SLICE_S`; returns what happened."""
+        """Wait for at most :data:`SLICE_S`, and return the events."""
         return []
 
     def expect(self, answer: bytes) -> None:
-        """The next `go` is to be answered with this line; "" if it is not to be accepted."""
+        """Set the line that answers the next `go`. "" means that it is not accepted."""
 
     def send(self, line: bytes) -> None:
-        """Send a line; from any thread."""
+        """Send a line, from any thread."""
 
     def finish(self) -> bytes:
-        """Receive nothing more; returns the bytes that ``poll`` has not returned yet."""
+        """Stop receiving, and return the bytes that ``poll`` has not returned yet."""
         return b""
 
     def close(self) -> None:
-        """Close the connection; ``poll`` is not called any more."""
+        """Close the connection. ``poll`` is no longer called."""
 
 
 class SimulatedLink(Link):
-    """A simulated control system: it loads atoms and sends `go`, on the session's clock."""
+    """A simulated control system, which loads atoms and sends `go` on the session's clock."""
 
     address = "simulated"
     listens = False
@@ -105,14 +105,14 @@ class SimulatedLink(Link):
         return encoded(f"{GO} {self._n_sent}")
 
     def arrange_reply(self, reply: str, timeout_s: float) -> bytes:
-        """Take the time of a step, and say that it is done; the light is there at once."""
+        """Take the time of a step, then report that it is done. The light is on at once."""
         if reply == "done":
             self._context.clock.sleep(min(self._delay_s, timeout_s))
         return encoded(reply)
 
 
 class SerialLink(Link):
-    """A serial port that is opened exclusively, and opened again if it was unplugged."""
+    """A serial port that is opened exclusively, and reopened after it was unplugged."""
 
     def __init__(self, settings: SerialLeaderSettings, device: str) -> None:
         self.address = settings.port
@@ -124,11 +124,11 @@ class SerialLink(Link):
         self._sending = threading.Lock()
 
     def open(self) -> None:
-        """Open the port; there may be none, or another program may have it open."""
+        """Open the port. Fails if it does not exist or another program has opened it."""
         self._port = open_port(self.address, self._device, self._baud_rate, write_timeout=SEND_S)
 
     def poll(self) -> list[Event]:
-        """Receive; open a port that was unplugged."""
+        """Receive bytes, or reopen a port that was unplugged."""
         if self._port is None:
             self._reopen()
             return []

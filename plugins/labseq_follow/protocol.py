@@ -25,15 +25,15 @@ from labseq_follow.relay import ANSWERED, LONGEST
 from labseq_follow.requests import Request, read_request
 
 MARKED: Final = re.compile(rf"{ANSWERED.decode()}(\d+\.\d+){ANSWERED.decode()}", re.ASCII)
-"""What precedes a `go` that was answered, and the time at which it came."""
+"""The mark before a `go` that was already answered, with the time at which the `go` came."""
 NOT_ANSWERED: Final = "error"
-"""Lines that begin so are never answered, or two programs could exchange errors forever."""
+"""Lines that begin with this are never answered, or two programs could exchange errors forever."""
 
 EXPECTED: Final = "expected go, set, abort, state? or hello"
 REPLIES: Final = ("done", "lit", "dark")
-"""What a control system replies to labseq's requests."""
+"""Replies of a control system to labseq's requests."""
 UNANSWERED: Final = "unanswered"
-"""In place of a reply: the control system that owes it has left, and no other one can give it."""
+"""Replaces a reply if the control system that owes it has left. No other can give it."""
 
 About = Mapping[str, Any]
 
@@ -45,24 +45,24 @@ class _Go:
     request: Request
     came_s: float
     due_s: float
-    """When it must be answered; infinite while labseq waits for a step of the control system."""
+    """Deadline for the answer. Infinite while labseq waits for a step of the control system."""
     taken_s: float = math.nan
-    """When a step took it; nan if none has."""
+    """Time when a step took it, or nan."""
     is_aborted: bool = False
     """Whether the control system asked to end its shot."""
     answered: str = ""
-    """"late" or "gone" if no answer follows any more; "" if one is still to come."""
+    """"late" or "gone" if no answer will follow, or "" if one is still to come."""
 
     @property
     def taken(self) -> bool:
-        """Whether a step has waited for it."""
+        """Whether a step has taken it."""
         return not math.isnan(self.taken_s)
 
 
 class Dialogue:
     """Makes sure that each `go` gets exactly one answer. It does no I/O and is not safe for threads.
 
-    The lines that its methods return are to be sent; all times are on one clock.
+    Its methods return the lines to send. All times are on one clock.
 
     Args:
         deadline_s: Longest time from `go` to its answer.
@@ -72,10 +72,10 @@ class Dialogue:
         is_waiting: Whether a step waits for `go`.
         is_connected: Whether a control system is connected.
         asked: What the control system asked for when it connected.
-        unchecked: The values of a `set` that nobody has checked yet; None if there are none.
-        awaited: The reply that labseq waits for; "" for none; UNANSWERED if it will not come.
+        unchecked: The values of a `set` that still have to be checked, or None.
+        awaited: The reply that labseq waits for, "" for none, or UNANSWERED if it will not come.
         reply: Text of the last reply.
-        log: What happened.
+        log: Messages about the connection.
     """
 
     def __init__(self, deadline_s: float, shape: tuple[int, int] = (0, 0)) -> None:
@@ -93,29 +93,29 @@ class Dialogue:
 
     @property
     def state(self) -> str:
-        """From `go` to the end of its shot "busy", while a step waits "waiting", else "idle"."""
+        """ "busy" from `go` to the end of its shot, "waiting" while a step waits, else "idle"."""
         if self._go is not None:
             return "busy"
         return "waiting" if self.is_waiting else "idle"
 
     @property
     def can_be_asked(self) -> bool:
-        """Whether the control system that began the shot is connected; any one for a shot without `go`."""
+        """Whether the control system that began the shot is connected, or any for a shot without `go`."""
         return self.is_connected and (self._go is None or self._go.answered != "gone")
 
     @property
     def is_aborted(self) -> bool:
-        """Whether the shot that goes on is to end."""
+        """Whether the control system asked to end the shot in progress."""
         return self._go is not None and self._go.is_aborted
 
     def connected(self, who: str, asked: Asked = Asked()) -> list[str]:  # noqa: B008 - frozen
-        """A control system has connected."""
+        """Handle a control system that has connected."""
         self.is_connected, self.asked = True, asked
         self.log.note(f"{who} leads")
         return [self._hello()]
 
     def lost(self, reason: str) -> None:
-        """The control system is gone: a `go` for which no step waited is dropped; a shot goes on."""
+        """Handle a lost connection. A `go` that no step has taken is dropped, but a shot continues."""
         self.is_connected, self.unchecked, self._set = False, None, {}
         if self.awaited:
             self.awaited = UNANSWERED  # until the shot ends, even if another leader connects before
@@ -124,10 +124,10 @@ class Dialogue:
             self._go = None
         elif self._go is not None and not self._go.answered:
             self._go.answered = "gone"
-            self.log.note("its shot continues; its result will not be sent")
+            self.log.note("its shot continues, but its result will not be sent")
 
     def receive_line(self, received: str, now_s: float) -> list[str]:
-        """Handle a line that came; a `go` after the mark of :mod:`labseq_follow.relay` was answered."""
+        """Handle a received line. A `go` after the mark of :mod:`labseq_follow.relay` is already answered."""
         answered = MARKED.match(received)
         sent = received[answered.end() if answered else 0 :].strip()
         request = read_request(sent, with_values=self.asked.form is not Form.SHORT)
@@ -150,22 +150,22 @@ class Dialogue:
 
     @property
     def next_answer(self) -> str:
-        """The line that answers the next `go`; "" if that is to be refused."""
+        """The line that answers the next `go`, or "" if `go` is to be refused."""
         return self._line("busy") if self._go is None else ""
 
     def error(self, reason: str) -> str:
-        """The line that refuses what a control system sent."""
+        """The line that refuses a line of the control system."""
         return self._line("error", reason)
 
     def take(self, now_s: float) -> str | None:
-        """Take a pending `go` for a step that waits: its text; None if there is none."""
+        """Take a pending `go` for a waiting step. Returns its text, or None if there is none."""
         if self._go is None or self._go.taken or now_s >= self._go.due_s:
             return None
         self._go.taken_s = now_s
         return visible(self._go.request.text)
 
     def take_values(self) -> Mapping[str, str]:
-        """The values for the shot that begins: those of `set`, then those of the `go` that was taken."""
+        """The values for the shot that begins, from `set` and then from the `go` that was taken."""
         sent = {**self._set, **(self.unchecked or {})}
         self._set, self.unchecked = {}, None
         if self.awaited == UNANSWERED:  # since the last shot
@@ -173,7 +173,7 @@ class Dialogue:
         return sent if self._go is None else {**sent, **self._go.request.values}
 
     def check_set(self, reason: str) -> list[str]:
-        """Answer a `set` whose values have been checked; ``reason`` is why they are refused, or ""."""
+        """Answer a `set` whose values have been checked. ``reason`` is why they are refused, or ""."""
         values, self.unchecked = self.unchecked, None
         if reason:
             return [self.error(reason)]
@@ -181,20 +181,20 @@ class Dialogue:
         return [self._line("set")]
 
     def request(self, word: str, facts: About, reply: str, now_s: float) -> list[str]:
-        """Ask the control system for something; its own time does not count towards the deadline."""
+        """Send the control system a request. Its own time does not count towards the deadline."""
         self.awaited, self.reply = reply, ""
         if self._go is not None and reply == "done":
             self._left_s, self._go.due_s = self._go.due_s - now_s, math.inf
         return [line(self.asked.form, word, facts)]
 
     def end_request(self, now_s: float) -> None:
-        """The reply has come, or nobody waits for it any longer."""
+        """End a request, because the reply has come or is no longer awaited."""
         self.awaited = ""
         if self._go is not None and self._go.due_s == math.inf:
             self._go.due_s = now_s + self._left_s
 
     def image(self, about: About) -> list[str]:
-        """Tell an image as soon as it is known, if the control system has asked for that."""
+        """Send an image as soon as it is known, if the control system has asked for that."""
         go, start_s = self._go, about["start_s"]
         if not self.asked.each_image or (go.answered if go else not self.asked.listens):
             return []
@@ -203,9 +203,9 @@ class Dialogue:
         return [line(self.asked.form, "image", {"shot": about["shot"], **facts})]
 
     def report(self, state: str, about: About, now_s: float) -> tuple[str, list[str]]:
-        """The shot of a `go` is over: the answer (``labseq.plugin.LeaderLink.report``) and lines to send."""
+        """End a `go`. Returns the answer as in ``labseq.plugin.LeaderLink.report``, and lines to send."""
         if state == "failed":
-            self.awaited = ""  # else the next shot would wait for this reply before its own `go`
+            self.awaited = ""  # otherwise the next shot would wait for this reply before its own `go`
         if self._go is None or not self._go.taken:
             return "", self._tell(state, about, now_s)
         late = self.overdue(now_s)
@@ -216,7 +216,7 @@ class Dialogue:
         return state, [line(self.asked.form, state, facts)]
 
     def _tell(self, state: str, about: About, now_s: float) -> list[str]:
-        """Tell the end of a shot that no `go` began, if the control system has asked for that."""
+        """Report the end of a shot that no `go` began, if the control system has asked for that."""
         if not (self.asked.listens and self.is_connected and "start_s" in about):
             return []
         start_s = about["start_s"]
@@ -272,7 +272,7 @@ class Dialogue:
         return [self.error(f"what is '{one_line(sent)[:40]}'? {EXPECTED}")]
 
     def _abort(self) -> list[str]:
-        """End the shot: at once if no step has taken its `go`, otherwise before it next moves atoms."""
+        """End the shot, at once if no step has taken its `go`, otherwise before it next moves atoms."""
         if self._go is None:
             return [self.error("no shot to abort")]
         self.log.note("the leader aborted its shot")
@@ -285,7 +285,7 @@ class Dialogue:
     def _receive_hello(self, words: str) -> list[str]:
         first, _, others = words.partition(" ")
         try:
-            self.asked = asked_for(words if "=" in first else others)  # the token has done its work
+            self.asked = asked_for(words if "=" in first else others)  # the token has already been checked
         except ValueError as error:
             return [self.error(str(error))]
         return [self._hello()]
@@ -294,7 +294,7 @@ class Dialogue:
         return line(self.asked.form, "failed", {"reason": reason})
 
     def _line(self, word: str, text: str = "") -> str:
-        """A line without facts: "state busy"; in JSON its text has a key."""
+        """A line without facts, such as "state busy". In JSON its text has a key."""
         if self.asked.form is Form.JSON:
             key = "state" if word == "state" else "reason"
             return line(self.asked.form, word, {key: text} if text else {})
@@ -316,13 +316,13 @@ class Splitter:
         self._begun = b""
 
     def feed(self, came: bytes) -> list[str | None]:
-        """The lines that are complete; None for each that was too long."""
+        """The complete lines, with None for each line that was too long."""
         *lines, begun = (self._begun + came).split(b"\n")
         self._begun = begun[: LONGEST + 1]  # enough to see that it is too long
         return [_decoded(part) if len(part) <= LONGEST else None for part in lines]
 
     def rest(self) -> str:
-        """The part of a line that has not ended; it is dropped."""
+        """The beginning of an unfinished line, which is then dropped."""
         rest, self._begun = self._begun, b""
         return _decoded(rest)
 

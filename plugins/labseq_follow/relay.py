@@ -1,8 +1,8 @@
-"""A process beside the run that answers `go` while the run writes a shot.
+"""A separate process that answers `go` while the run writes a shot.
 
 Encoding a shot keeps Python's interpreter lock for several milliseconds at a time, so no thread of the run
-can answer within one. The process shares the socket of the control system: it receives for the run, and
-answers `go` with a line that the run has given it in advance. It imports the standard library alone.
+can answer within one. The process shares the socket of the control system. It receives for the run, and
+answers `go` with a line that the run has given it in advance. It imports only the standard library.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from contextlib import suppress
 from typing import Final
 
 ANSWERED: Final = b"\x06"
-"""Stands around the time at which a `go` came that was answered; taken out of what a control system sends."""
+"""Encloses the time of an answered `go`. Removed from the bytes that a control system sends."""
 LONGEST: Final = 4000
-"""More than this without a line feed is passed on as it is; the run says that the line is too long."""
+"""More bytes than this without a line feed are passed on, and the run replies that the line is too long."""
 GO: Final = re.compile(rb'\s*(go(\s|$)|\{\s*"go")')
 """The beginning of a `go`, as words or as a JSON object."""
 EXIT_S: Final = 2.0
 
 
 class Relay:
-    """The process, for one control system; started before it connects, which takes a moment.
+    """The process for one control system. Started before it connects, because starting takes a moment.
 
     Attributes:
-        received: Socket with what the control system sends; it ends when the control system leaves.
+        received: Socket with the bytes of the control system. It ends when the control system leaves.
     """
 
     def __init__(self) -> None:
@@ -45,19 +45,19 @@ class Relay:
             )
 
     def serve(self, leader: socket.socket) -> None:
-        """Receive from a control system from now on."""
+        """Start to receive from a control system."""
         socket.send_fds(self.received, [b"\n"], [leader.fileno()])
         self.received.setblocking(False)
 
     def expect(self, answer: bytes) -> None:
-        """Answer the next `go` with this line, once; "" to leave it to the run."""
+        """Answer the next `go` with this line, once. "" leaves it to the run."""
         if answer != self._answer:
             self._answer = answer
-            with suppress(OSError):  # it has ended, which is seen at ``received``
+            with suppress(OSError):  # the process has ended, which ``received`` shows
                 self.received.send(answer or b"\n")
 
     def finish(self) -> bytes:
-        """Answer nothing more; returns what was received, and perhaps answered, but not yet read."""
+        """Stop answering. Returns bytes that were received, and perhaps answered, but not yet read."""
         rest = b""
         with suppress(OSError):
             self.received.shutdown(socket.SHUT_WR)
@@ -77,7 +77,7 @@ class Relay:
 
 
 def can_relay() -> bool:
-    """Whether this system can hand a socket to another process in this way; Windows cannot."""
+    """Whether this system can pass a socket to another process in this way. Windows cannot."""
     return hasattr(socket, "send_fds")
 
 
@@ -88,7 +88,7 @@ def _relay(run: socket.socket, leader: socket.socket) -> None:
     run.setblocking(True)
     while True:
         readable = select.select([run, leader], [], [])[0]
-        # what the run has said before the control system could answer it comes first
+        # the run's earlier messages, which the control system could not answer yet, come first
         while select.select([run], [], [], 0)[0]:
             said = run.recv(4096)
             if not said:
@@ -109,7 +109,7 @@ def _relay(run: socket.socket, leader: socket.socket) -> None:
             if answer and GO.match(line) and len(line) <= LONGEST:
                 with suppress(OSError):
                     leader.send(answer + b"\n")
-                # the run may read it much later; a monotonic time is the same in all processes
+                # the run may read it much later, but a monotonic time is the same in all processes
                 answer, mark = b"", b"%s%.6f%s" % (ANSWERED, time.monotonic(), ANSWERED)
             run.sendall(mark + line + b"\n")
         if begun and (not came or len(begun) > LONGEST):
@@ -123,7 +123,7 @@ def main(fileno: int) -> None:
     """Wait for the control system's socket, then serve it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if sys.platform == "linux":
-        with suppress(OSError):  # the system does not allow it; then other programs may delay the answer
+        with suppress(OSError):  # if the system does not allow it, other programs may delay the answer
             # above all ordinary programs, and below the thread of a shot's steps, which has 20
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
     with socket.socket(fileno=fileno) as run:

@@ -1,4 +1,4 @@
-"""What a control system asks for, read from its lines."""
+"""Reads the requests in the lines of a control system."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, cast
 
 VALUE: Final = re.compile(r"""(?:^|\s)([A-Za-z_][\w.-]*)=("[^"]*"|'[^']*'|\S*)(?=\s|$)""")
-"""An address and its value; a value with spaces stands in quotation marks."""
+"""An address and its value. A value with spaces is in quotation marks."""
 TAKES_VALUES: Final = ("go", "set")
 
 
@@ -18,10 +18,10 @@ class Request:
     """A line of a control system.
 
     Attributes:
-        word: What it asks for: "go".
+        word: Kind of request, such as "go".
         text: The rest of the line, without the values.
         values: Address -> value as for ``--set``.
-        problem: Why the values cannot be read; "" if they can.
+        problem: Why the values cannot be read, or "".
     """
 
     word: str
@@ -31,10 +31,10 @@ class Request:
 
 
 def read_request(line: str, *, with_values: bool) -> Request:
-    """Read a line of words, or a JSON object: ``{"go": "run 17", "values": {"shot.hold.duration": 2}}``.
+    """Read a line of words, or a JSON object like ``{"go": "run 17", "values": {"shot.hold.duration": 2}}``.
 
     Args:
-        with_values: Whether "key=value" in a line of words is a value; in version 2 it is text.
+        with_values: Whether "key=value" in a line of words is a value. In version 2 it is text.
 
     Example:
         >>> read_request('go run 17 shot.hold.duration="5 ms"', with_values=True).values
@@ -51,7 +51,7 @@ def read_request(line: str, *, with_values: bool) -> Request:
 
 
 def _read_object(line: str) -> Request:
-    """Read a JSON object; one that begins as a `go` does is a `go`, because it may be answered already."""
+    """Read a JSON object. If it begins like a `go`, it is a `go`, because it may be answered already."""
     begins = re.match(r'\{\s*"(\w+)"', line)
     word = begins[1] if begins else ""
     if word not in TAKES_VALUES:

@@ -18,17 +18,17 @@ class LinkSettings(LeaderSettings):
     """Settings for any connection."""
 
     leader: Literal["real", "simulated"] = Field(
-        default="real", description="simulated: a simulated control system sends `go`, as in a dry run"
+        default="real", description="with `simulated` a simulated control system sends `go`, as in a dry run"
     )
     loads: bool = Field(
         default=False,
-        description="with a real control system and a simulated lab: atoms load at `go`, unless there "
-        "are some",
+        description="load atoms at `go`, unless there are some, with a real control system and a simulated "
+        "lab",
     )
     light: Literal["own", "asked"] = Field(
         default="own",
-        description="asked: labseq asks the control system for the imaging light at each image; own: it "
-        "does not ask",
+        description="with `asked` labseq asks the control system for the imaging light at each image, with "
+        "`own` it does not ask",
     )
     light_timeout: PositiveDuration = Field(
         default=1.0, description="longest time for the control system to turn the imaging light on or off"
@@ -42,23 +42,23 @@ class TcpLeaderSettings(LinkSettings):
         default="127.0.0.1", description="address of this computer on which labseq listens"
     )
     port: int = Field(
-        default=5750, ge=0, le=65535, description="port on which labseq listens; 0: any free one"
+        default=5750, ge=0, le=65535, description="port on which labseq listens, or 0 for any free port"
     )
     allow_remote: bool = Field(
         default=False,
-        description="whether other computers may connect; they need the token, which labseq keeps in "
+        description="whether other computers may connect, with the token that labseq keeps in "
         "`leader.token` of its state folder",
     )
 
     def identities(self) -> tuple[str, ...]:
-        """What only one process can use of it."""
+        """Identifiers that only one process can use at a time."""
         return (f"TCP port {self.port}",) if self.port else ()
 
     @model_validator(mode="after")
     def _check_host(self) -> Self:
         if not self.allow_remote and not wire.is_loopback(self.host):
             what = f"host is '{clean(self.host)}', which other computers can reach"
-            hint = "or set 'allow_remote: true' in a network in which nobody else listens"
+            hint = "or set 'allow_remote: true' if nobody else can listen on the network"
             raise setting_error(
                 what, "an address that only this computer can reach, such as 127.0.0.1", hint, at=("host",)
             )
@@ -66,13 +66,13 @@ class TcpLeaderSettings(LinkSettings):
 
 
 class SerialLeaderSettings(LinkSettings):
-    """An external control system on a serial line: 8 data bits, no parity, 1 stop bit."""
+    """An external control system on a serial line with 8 data bits, no parity and 1 stop bit."""
 
     port: Annotated[str, Field(min_length=1)] = Field(
-        description="the port: `/dev/ttyUSB0`, `COM3`, or a URL of pyserial"
+        description="the port, such as `/dev/ttyUSB0`, `COM3` or a URL of pyserial"
     )
     baud_rate: int = Field(default=115200, ge=1, description="bits per second")
 
     def identities(self) -> tuple[str, ...]:
-        """What only one process can use of it."""
+        """Identifiers that only one process can use at a time."""
         return port_identities(self.port)

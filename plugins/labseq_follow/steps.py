@@ -1,4 +1,4 @@
-"""The step ``leader``: what the other control system does in the middle of a shot."""
+"""The step ``leader``, which the other control system carries out in the middle of a shot."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from labseq.plugin.leader import LEADER, speaking_leader
 
 
 class LeaderStepSettings(Settings):
-    """``leader``: let the external control system do a step of its own, such as the science."""
+    """``leader`` lets the external control system do a step of its own, such as the science."""
 
     step: Text = Field(description="name of the step, which the control system receives")
-    timeout: PositiveDuration = Field(description="longest time until it is done; then the shot fails")
+    timeout: PositiveDuration = Field(description="longest time until it is done, after which the shot fails")
     device: Text | None = Field(
-        default=None, description="device of the profile that it speaks through; needed if several could"
+        default=None, description="device of the control system, needed if the profile has several"
     )
 
 
 class LeaderStep(Step):
-    """Tells the control system that it is its turn, and waits until it says that it is done."""
+    """Gives the control system its turn, and waits until it reports the end."""
 
     notes = ()
 
@@ -42,15 +42,15 @@ class LeaderStep(Step):
         devices: Mapping[str, object],
         context: StepContext,  # noqa: ARG002 - of the role
     ) -> Mapping[str, str]:
-        """Find the device that the control system speaks through."""
+        """Find the device that connects the control system."""
         fault = speaking_leader(devices, self.settings.device or "")
         return {"device" if self.settings.device else "step": fault} if fault else {}
 
     def plan_timeline(self, context: StepContext) -> Sequence[TimelineEntry]:  # noqa: ARG002 - of the role
-        """One entry, at most the timeout; it has no kind, because the control system may switch any light."""
+        """One entry, at most the timeout. It has no kind, because the control system may switch any light."""
         settings = self.settings
         return [TimelineEntry(f"leader: {settings.step}", settings.timeout, 0.0, timed_by=TimedBy(LEADER))]
 
     def run(self, shot: Shot) -> None:
-        """Wait until it is done."""
+        """Wait until the control system's step is done."""
         shot.leave_to_leader(self.settings.step, self.settings.timeout, self.settings.device or "")

@@ -28,18 +28,18 @@ from labseq_follow.settings import TcpLeaderSettings
 TAKEN: Final = encoded("error another leader is connected; one at a time")
 NO_TOKEN: Final = encoded("error the first line must be 'hello' and the token")
 FIRST_LINE_S: Final = 2.0
-"""Longest time from a connection to the end of its first line."""
+"""Longest time from a connection to the end of its first line, in seconds."""
 BACKLOG: Final = 128
 """Connections that the system keeps until they are accepted."""
 MAX_NEWCOMERS: Final = 16
-"""Connections that may wait for their first line; of more, the oldest is closed."""
+"""Maximum number of connections that wait for their first line. Beyond it, the oldest is closed."""
 TOKEN: Final = re.compile(rb"[A-Za-z0-9_-]{16,100}")
 KEEPALIVE: Final = (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 2), ("TCP_KEEPCNT", 3))
 """A control system whose computer lost power is noticed after 11 s, so that another can connect."""
 
 
 class TcpLink(Link):
-    """Listens on a port; the first control system that sends `hello` and the token stays until it leaves."""
+    """Listens on a port. The first control system that sends `hello` and the token leads until it leaves."""
 
     def __init__(self, settings: TcpLeaderSettings, device: str) -> None:
         self._host, self._port = settings.host, settings.port
@@ -56,7 +56,7 @@ class TcpLink(Link):
         self._sending = threading.Lock()
 
     def open(self) -> None:
-        """Listen; the port may be taken, or the host not an address of this computer."""
+        """Listen. Fails if the port is taken, or the host is not an address of this computer."""
         host, port = self._host, self._port
         self._token = _read_token(self.token_file, self._device)
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -73,7 +73,7 @@ class TcpLink(Link):
         self._relay = Relay() if can_relay() else None
 
     def poll(self) -> list[Event]:
-        """Accept connections, receive from them, notice that the control system left."""
+        """Accept connections, receive from them, and notice if the control system left."""
         assert self._selector is not None
         events: list[Event] = []
         for key, _ in self._selector.select(SLICE_S):
@@ -88,13 +88,13 @@ class TcpLink(Link):
         return events + self._refuse_late_newcomers()
 
     def expect(self, answer: bytes) -> None:
-        """Let the process beside the run answer the next `go`, if there is one."""
+        """Let the separate process, if there is one, answer the next `go`."""
         with self._sending:
             if self._relay is not None and self._leader is not None:
                 self._relay.expect(answer)
 
     def send(self, line: bytes) -> None:
-        """Send a line; a control system that does not take it is disconnected, and never waited for."""
+        """Send a line. A control system that does not take it is disconnected at once."""
         with self._sending:
             if self._leader is None:
                 raise ConnectionError("no leader is connected")
@@ -104,11 +104,11 @@ class TcpLink(Link):
                 n_sent = 0
             if n_sent < len(line):
                 with suppress(OSError):
-                    self._leader.shutdown(socket.SHUT_RDWR)  # after half a line nothing more may follow
-                raise ConnectionError("it does not read; its connection was closed")
+                    self._leader.shutdown(socket.SHUT_RDWR)  # nothing may follow half a line
+                raise ConnectionError("it does not read, so its connection was closed")
 
     def finish(self) -> bytes:
-        """End the receiving: the process beside the run may have answered a `go` that is not known here."""
+        """Stop receiving. The separate process may have answered a `go` that was not read yet."""
         return b"" if self._relay is None or self._leader is None else self._relay.finish()
 
     def close(self) -> None:
@@ -136,7 +136,7 @@ class TcpLink(Link):
         self._selector.register(peer, selectors.EVENT_READ)
         self._newcomers[peer] = _Newcomer(f"{who[0]}:{who[1]}", time.monotonic())
         if len(self._newcomers) > MAX_NEWCOMERS:
-            return self._refuse(next(iter(self._newcomers)), "too many connections wait")
+            return self._refuse(next(iter(self._newcomers)), "too many connections are waiting")
         return []
 
     def _refuse_late_newcomers(self) -> list[Event]:
@@ -166,7 +166,7 @@ class TcpLink(Link):
         except ValueError as error:
             return self._refuse(peer, str(error), encoded(f"error {error}"))
         if self._leader is not None:
-            return self._refuse(peer, "another one is in control", TAKEN)
+            return self._refuse(peer, "another control system leads", TAKEN)
         return self._welcome(peer, asked, rest)
 
     def _welcome(self, peer: socket.socket, asked: Asked, rest: bytes) -> list[Event]:
@@ -176,7 +176,7 @@ class TcpLink(Link):
             if (number := getattr(socket, option, None)) is not None:
                 peer.setsockopt(socket.IPPROTO_TCP, number, value)
         who = self._newcomers.pop(peer).who
-        with self._sending:  # the first that its process receives must be the socket, not an answer to expect
+        with self._sending:  # its process must receive the socket first, not an expected answer
             if self._relay is not None and self._selector is not None:
                 self._selector.unregister(peer)
                 self._relay.serve(peer)
@@ -185,12 +185,12 @@ class TcpLink(Link):
         return [("connected", who, asked), *([("came", rest)] if rest else [])]
 
     def _refuse(self, peer: socket.socket, why: str, answer: bytes = b"") -> list[Event]:
-        """Close the connection of a newcomer; a flood of them must not fill the log."""
+        """Close the connection of a newcomer, but do not let a flood of them fill the log."""
         who = self._newcomers[peer].who
         with suppress(OSError):
             peer.send(answer)
             peer.shutdown(socket.SHUT_WR)
-            peer.recv(4096)  # unread data could make its side drop our line
+            peer.recv(4096)  # because of unread data its side could drop our line
         self._forget(peer)
         self._n_refused += 1
         if self._n_refused & (self._n_refused - 1):
@@ -205,7 +205,7 @@ class TcpLink(Link):
         peer.close()
 
     def _received_from(self) -> socket.socket | None:
-        """The socket with what the control system sends; None while none is connected."""
+        """The socket with the bytes of the control system. None while none is connected."""
         return self._relay.received if self._relay is not None and self._leader is not None else self._leader
 
     def _receive(self) -> list[Event]:
@@ -233,7 +233,7 @@ class TcpLink(Link):
             self._leader = None
             if self._relay is not None:
                 self._relay.close()
-                self._relay = Relay()  # for the next one
+                self._relay = Relay()  # for the next control system
 
 
 @dataclass(slots=True)
@@ -252,16 +252,16 @@ def _token_file() -> Path | None:
 
 def _make_token(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)  # closed to others from the start
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)  # private from the start
     with os.fdopen(descriptor, "wb") as file:
         file.write(secrets.token_hex(16).encode() + b"\n")
 
 
 def _read_token(path: Path | None, device: str) -> bytes:
-    """The token in a file, which is made if there is none.
+    """Read the token in a file, which is made if it does not exist.
 
     Raises:
-        DeviceError: The file cannot be read, others can read it, or it holds no token.
+        DeviceError: The file cannot be read, others can read it, or it contains no token.
     """
     if path is None:
         raise DeviceError(device, "this user has no folder for the token; set LABSEQ_STATE to one")
@@ -279,5 +279,5 @@ def _read_token(path: Path | None, device: str) -> bytes:
     if os.name == "posix" and mode & 0o077:
         raise DeviceError(device, f"other users can read the token in {path}; run 'chmod 600 {path}'")
     if not TOKEN.fullmatch(token):
-        raise DeviceError(device, f"{path} holds no token; expected 16 to 100 letters or digits on one line")
+        raise DeviceError(device, f"{path} has no token; expected 16 to 100 letters or digits on one line")
     return token

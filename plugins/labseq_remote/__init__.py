@@ -1,4 +1,4 @@
-"""Devices of other computers, which `labseq serve-devices` serves there."""
+"""Drivers of devices on other computers, where `labseq serve-devices` serves them."""
 
 from labseq.plugin import Registry, hookimpl
 

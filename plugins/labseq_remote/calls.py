@@ -1,4 +1,4 @@
-"""Calls of a served device's methods: their numbers, their replies, and how they are aborted."""
+"""Calls of a served device's methods, with their numbers and replies, and how they are aborted."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from labseq_remote.control import Control, Heartbeat, read_message
 from labseq_remote.life import Life
 
 POLL_S: Final = 0.05
-"""How often a call that waits looks for a stop request."""
+"""Interval at which a waiting call checks for a stop request, in seconds."""
 GRACE_S: Final = 0.4
-"""How long a call may take to end after it was aborted; then its device is made safe beside it."""
+"""Longest time for an aborted call to end, in seconds. Then its device is made safe in parallel."""
 
 
 class Calls:
     """Calls over one connection, one at a time.
 
     Args:
-        life: That of the connection.
-        control: Where calls are aborted.
-        heartbeat: Says whether the server has a call under way.
-        clock: The session's clock, on which the times of frames are.
-        socket: Connected to the device's port; receives for :data:`POLL_S`.
+        life: Life of the connection.
+        control: The control, which aborts calls.
+        heartbeat: Heartbeat, which reports whether the server is carrying out a call.
+        clock: The session's clock, for the times of frames.
+        socket: Socket connected to the device's port. Receives for :data:`POLL_S`.
         state: Updated with the properties that come with the replies.
     """
 
@@ -49,7 +49,7 @@ class Calls:
         self._number = self._given_up = 0
 
     def call(self, session: bytes, name: str, args: list[Any], named: dict[str, Any], stoppable: bool) -> Any:
-        """Have the server call a method of the device, and wait for its end; see ``Connection.call``."""
+        """Have the server call a method of the device, and wait for its end. See ``Connection.call``."""
         with self._calling:
             if self._life.is_over:
                 raise self._life.failure()
@@ -64,7 +64,7 @@ class Calls:
 
     @property
     def is_hanging(self) -> bool:
-        """Whether the server is still carrying out a call, which others would have to wait for."""
+        """Whether the server is still carrying out a call, so that others would have to wait."""
         if self._calling.locked():
             return True
         if self._given_up == self._number and not self._life.lost:
@@ -77,7 +77,7 @@ class Calls:
         self._control.ask("abort", timeout_s, number=self._number)
 
     def close(self) -> None:
-        """Close the socket, unless a call is still waiting at it."""
+        """Close the socket, unless a call still waits on it."""
         if self._calling.acquire(timeout=2 * POLL_S):
             self._socket.close()
             self._calling.release()
@@ -93,10 +93,10 @@ class Calls:
             while not self._life.is_over:
                 if reply := self._receive(name):
                     if why is not None:
-                        raise why  # the device may have been made safe beside the call, which ended it
+                        raise why  # making the device safe in parallel may have ended the call
                     return reply
                 if self._is_missing(sent_s):
-                    self._life.lose(f"{name}() got no reply although the server has none under way")
+                    self._life.lose(f"{name}() got no reply although the server has no call in progress")
                 if why is None and stoppable:
                     give_up_s = time.monotonic() + GRACE_S
                     why = self._abort_if_asked()
@@ -108,15 +108,15 @@ class Calls:
         raise self._life.failure()
 
     def _abort_if_asked(self) -> LabseqError | None:
-        """Have the server end the call if there is a reason; returns it."""
+        """Have the server end the call if there is a reason. Returns the reason."""
         why = self._reason_to_stop()
         if why is not None:
-            with suppress(DeviceError):  # else the connection is lost, too
+            with suppress(DeviceError):  # otherwise the connection is also lost
                 self.abort(min(GRACE_S, wire.LOST_S))
         return why
 
     def _receive(self, name: str) -> dict[str, Any]:
-        """The reply to the call, if it comes within :data:`POLL_S`; else nothing."""
+        """The reply to the call, or {} if none comes within :data:`POLL_S`."""
         import zmq
 
         try:
@@ -129,7 +129,7 @@ class Calls:
         return reply if reply.get("n") in (self._number, 0) else {}
 
     def _reason_to_stop(self) -> LabseqError | None:
-        """Why a call is aborted: a request to stop, or another connection of the run that is lost."""
+        """Why a call is aborted, which is a stop request or another lost connection of the run."""
         try:
             self._clock.check()
         except StopRequested as error:
@@ -137,13 +137,13 @@ class Calls:
         return self._life.failure_of_another()
 
     def _is_missing(self, sent_s: float) -> bool:
-        """Whether the server has not got the call, or its reply was lost on the way."""
+        """Whether the call did not reach the server, or its reply was lost."""
         late_s = sent_s + wire.LOST_S
         is_late = time.monotonic() > late_s and self._heartbeat.heard_s > late_s
         return is_late and not self._heartbeat.answer["running"] and not self._socket.poll(0)
 
     def _result(self, reply: dict[str, Any]) -> Any:
-        """The value of a reply; the time of a frame is on the session's clock."""
+        """The value of a reply. The time of a frame is on the session's clock."""
         if "error" in reply:
             error = wire.error_of(reply["error"], self._life.device, self._life.address)
             if isinstance(error, StopRequested):

@@ -1,4 +1,4 @@
-"""A connection to one served device: calls on one socket; heartbeats, questions and aborts on another."""
+"""A connection to one served device, with a socket for calls and another for heartbeats and control."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from labseq_remote.life import Life
 from labseq_remote.settings import RemoteSettings
 
 BYE_S: Final = 0.1
-"""How long a server may take to answer the end of a connection that is lost."""
+"""Longest time for a server to answer the end of a lost connection, in seconds."""
 SAFE_S: Final = 4.0
-"""How long making a device safe beside a call that hangs may take."""
+"""Longest time to make a device safe while a call hangs, in seconds."""
 
 
 class Connection:
     """A session with a served device.
 
     Attributes:
-        about: What the server says about itself and its driver.
+        about: Facts about the server and its driver.
         life: Whether the connection is lost.
-        control: Answers questions, also while a call is out.
+        control: The control, which answers even during a call.
 
     Args:
-        settings: Where the device is.
-        context: The driver's context, which the server constructs its driver with.
+        settings: Address and name of the device, and key of its server.
+        context: The driver's context, from which the server constructs its driver.
         kind: Kind of the device, "camera".
         state: Updated with the properties of the device that come with the replies.
 
@@ -61,18 +61,18 @@ class Connection:
         """Have the server call a method of the device, and wait for its end.
 
         Raises:
-            LabseqError: What the method raised there; or ``DeviceError``: the connection is lost.
-            StopRequested: The run was asked to stop; the call was aborted.
+            LabseqError: The error of the method, or a ``DeviceError`` because the connection is lost.
+            StopRequested: The run was asked to stop, and the call was aborted.
         """
         return self._calls.call(self.about["session"], name, list(args), named, stoppable)
 
     @property
     def is_hanging(self) -> bool:
-        """Whether the server is still carrying out a call, which others would have to wait for."""
+        """Whether the server is still carrying out a call, so that others would have to wait."""
         return self._calls.is_hanging
 
     def make_safe(self) -> None:
-        """Make the device safe, also while another call hangs.
+        """Make the device safe, even while another call hangs.
 
         Raises:
             DeviceError: It could not be made safe, or the connection is lost.
@@ -85,31 +85,31 @@ class Connection:
             if rescue == "safe":
                 return
             if rescue not in ("", "under way"):
-                raise self.life.failure(f"a call hangs, and safe_state() beside it failed: {rescue}")
+                raise self.life.failure(f"a call hangs, and safe_state() in parallel failed: {rescue}")
             if time.monotonic() > deadline_s:
                 raise self.life.failure("a call hangs, and the device could not be made safe")
             self.life.ended.wait(POLL_S)
         self.call("safe_state", stoppable=False)
 
     def close(self) -> None:
-        """End the connection; the server makes the device safe if that was not done."""
+        """End the connection. The server makes the device safe if that was not done."""
         if not self.life.ended.is_set():
             with suppress(LabseqError):
                 self.control.ask("bye", BYE_S if self.life.run_lost_one else None)
             self.life.end()
 
     def abandon(self) -> None:
-        """End the heartbeats of a driver that is no longer used; the collector of garbage may not wait."""
+        """End the heartbeats of an unused driver, without waiting, because the garbage collector calls it."""
         self.life.ended.set()
 
     def _close_sockets(self) -> None:
-        """Called by the thread of the heartbeat, which uses a socket, after the connection was closed."""
+        """Close the sockets. Called by the heartbeat's thread after the connection was closed."""
         self.control.close()
         self._calls.close()
 
 
 def served_context(name: str, context: Context) -> dict[str, Any]:
-    """What of the context the server's driver is constructed with."""
+    """The parts of the context that the server's driver needs."""
     return {
         "name": name,
         "grid": context.grid,
@@ -120,7 +120,7 @@ def served_context(name: str, context: Context) -> dict[str, Any]:
 
 
 def _keys(settings: RemoteSettings) -> tuple[Any, bytes | None]:
-    """The keys for a connection: this computer's, and the server's public one."""
+    """The keys for a connection, which are this computer's keys and the server's public key."""
     if settings.plain:
         return None, None
     root = wire.keys_root()

@@ -1,4 +1,4 @@
-"""The control of a server, which answers questions also while a call hangs; heartbeats; why nothing comes."""
+"""The control of a server (which answers even while a call hangs), heartbeats, and reasons of silence."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from labseq_remote.life import Life
 from labseq_remote.settings import RemoteSettings
 
 CONNECT_S: Final = 5.0
-"""How long connecting may take; a connection that is refused fails at once."""
+"""Longest time to connect, in seconds. A refused connection fails at once."""
 
 
 class Control:
     """Questions to the control of a server, one at a time, from any thread.
 
     Args:
-        life: That of the connection.
-        socket: Not connected yet.
+        life: Life of the connection.
+        socket: Socket, not connected yet.
     """
 
     def __init__(self, life: Life, socket: Any) -> None:
@@ -39,18 +39,18 @@ class Control:
         """Connect, and begin a session.
 
         Returns:
-            What the server says about itself, with the token of the session.
+            Facts about the server, with the token of the session.
 
         Raises:
             DeviceError: The server does not answer, refuses, or has another version.
-            ConfigError: This is the port of a device, not of its server.
+            ConfigError: The port belongs to a device, not to its server.
         """
         self._socket.connect(wire.endpoint(settings.host, settings.port))
         me = {"protocol": wire.PROTOCOL, "labseq": version("labseq")}
         who = f"{platform.node()}, process {os.getpid()}"
         try:
             about = self.ask("hello", CONNECT_S, device=settings.device, kind=kind, who=who, **me)
-        except ConfigError as error:  # the port is that of a device; the server does not know this profile
+        except ConfigError as error:  # it is the port of a device, and the server does not know this profile
             place = f"{self._life.device} at {self._life.address}"
             raise ConfigError([replace(problem, source=place) for problem in error.problems]) from error
         if not isinstance(about, dict) or about.get("protocol") != wire.PROTOCOL:
@@ -59,7 +59,7 @@ class Control:
         return about
 
     def ask(self, what: str, timeout_s: float | None = None, **about: Any) -> Any:
-        """Ask, and wait for the answer.
+        """Send a request, and wait for the answer.
 
         Raises:
             DeviceError: The server refuses, or does not answer in time.
@@ -68,7 +68,7 @@ class Control:
 
         timeout_s = wire.LOST_S if timeout_s is None else timeout_s
         late = f"the server did not answer within {timeout_s:.3g} s"
-        if not self._asking.acquire(timeout=timeout_s):  # a heartbeat is not answered
+        if not self._asking.acquire(timeout=timeout_s):  # a heartbeat is still unanswered
             raise self._life.failure(late)
         try:
             if self._life.ended.is_set():
@@ -76,7 +76,7 @@ class Control:
             self._n_asked += 1
             self._socket.send_multipart(wire.pack({**about, "n": self._n_asked, "op": what, **self._session}))
             return self._answer(timeout_s, late)
-        except zmq.Again:  # it cannot be sent: the connection was refused or has ended
+        except zmq.Again:  # it cannot be sent because the connection was refused or has ended
             raise self._life.failure(self._monitor.reason or late) from None
         except zmq.ZMQError as error:
             raise self._life.failure(f"{error.strerror}") from error
@@ -84,7 +84,7 @@ class Control:
             self._asking.release()
 
     def close(self) -> None:
-        """Close the socket, after the question that is under way."""
+        """Close the socket, after the request in progress."""
         with self._asking:
             self._monitor.close()
             self._socket.close()
@@ -93,7 +93,7 @@ class Control:
         deadline_s = time.monotonic() + timeout_s
         while self._monitor.wait(deadline_s - time.monotonic()):
             answer = read_message(self._socket.recv_multipart())
-            if answer.get("n") in (self._n_asked, 0):  # others are late answers to earlier questions
+            if answer.get("n") in (self._n_asked, 0):  # others are late answers to earlier requests
                 if "error" in answer:
                     raise wire.error_of(answer["error"], self._life.device, self._life.address)
                 return answer.get("value")
@@ -101,17 +101,17 @@ class Control:
 
 
 class Heartbeat:
-    """Signs of life, from a thread of their own, which notices when the server gives none.
+    """A thread that sends heartbeats and notices when the server does not answer.
 
     Attributes:
-        answer: The server's last one: number of the last call, whether it is under way, and what making the
-            device safe beside it has come to.
-        heard_s: When that was asked for.
+        answer: The server's last answer, with the number of the last call, whether it is in progress, and the
+            outcome of making the device safe in parallel.
+        heard_s: Time when that answer was requested.
 
     Args:
-        life: That of the connection.
-        control: Where it asks.
-        at_end: Called by the thread when the connection was closed.
+        life: Life of the connection.
+        control: The control, which receives the heartbeats.
+        at_end: Called by the thread after the connection was closed.
     """
 
     def __init__(self, life: Life, control: Control, at_end: Callable[[], object]) -> None:
@@ -135,7 +135,7 @@ class Heartbeat:
 
 
 class Monitor:
-    """Waits for messages at a socket; the socket's events say why there are none.
+    """Waits for messages at a socket. The socket's events give the reason if none come.
 
     Args:
         socket: The socket, before it connects.
@@ -152,9 +152,9 @@ class Monitor:
         self._seen: set[int] = set()
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether there is a message; False at once if the connection has ended, or cannot be made.
+        """Wait for a message. False at once if the connection has ended or cannot be made.
 
-        A message that is there counts, even if this computer stood still for longer than the time.
+        A message that has arrived counts, even if this computer was suspended for longer than the timeout.
         """
         until_s = time.monotonic() + timeout_s
         while True:
@@ -168,22 +168,22 @@ class Monitor:
 
     @property
     def reason(self) -> str:
-        """Why there is no connection; "" if there is one."""
+        """Why there is no connection, or "" if there is one."""
         import zmq
 
         self._read_events()
         if zmq.EVENT_HANDSHAKE_SUCCEEDED in self._seen:
             return "the server has ended" if self._has_ended else ""
         if zmq.EVENT_HANDSHAKE_FAILED_AUTH in self._seen:
-            what = "the server does not know the key of this computer, or no longer"
-            return f"{what}: its public key must be in the folder `known` there"
+            what = "the server does not know this computer's key, or no longer accepts it"
+            return f"{what}; put the public key into the folder `known` of the server's keys"
         if zmq.EVENT_CONNECTED in self._seen:
-            what = "it is not a server of devices, or the keys do not fit"
-            return f"{what}: both need keys, and each the public key of the other"
-        return "nothing answers there; is `labseq serve-devices` running, and its port open in the firewall?"
+            what = "it is not a device server, or the keys do not match"
+            return f"{what}; each computer needs its own keys and the other's public key"
+        return "nothing answers there; check that `labseq serve-devices` runs and the firewall opens its port"
 
     def close(self) -> None:
-        """End it, before the socket is closed."""
+        """Stop monitoring, before the socket is closed."""
         self._socket.disable_monitor()
         self._events.close()
 
@@ -201,7 +201,7 @@ class Monitor:
 
 
 def read_message(parts: Any) -> dict[str, Any]:
-    """A message; one that cannot be read is as good as none."""
+    """Read a message. An unreadable message counts as none."""
     try:
         message = wire.unpack(parts)
     except wire.MessageError:

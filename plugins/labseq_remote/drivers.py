@@ -1,7 +1,7 @@
-"""Drivers of devices on other computers: each method is a call to the server of the device.
+"""Drivers of devices on other computers, whose methods are calls to the server of the device.
 
-A driver lists what travels: the methods that the served device carries out, and the properties that come back
-with every answer. Their meaning is that of the role.
+A driver lists the methods that the served device carries out, and the properties that are returned
+with every answer. They have the same meaning as in the role.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from labseq_remote.settings import RemoteSettings
 
 
 def checked(name: str) -> Any:
-    """A check by the driver at the server, if it has it; the device need not be open."""
+    """A check by the driver at the server, if it has this check. The device need not be open."""
 
     def method(driver: RemoteHardware, /, *args: Any, **named: Any) -> None:
         if name in driver.link.about["abilities"]:
@@ -42,14 +42,14 @@ def checked(name: str) -> Any:
 
 
 class RemoteHardware(Hardware):
-    """What the drivers of all roles have in common.
+    """Base of the drivers of all roles.
 
     The device's emergency script belongs to the watchdog of the server, which also makes the device safe when
     the connection is lost.
 
     Args:
-        settings: Where the device is.
-        context: What the driver at the server is constructed with, too.
+        settings: Address and name of the device, and key of its server.
+        context: The context, from which the server also constructs its driver.
 
     Attributes:
         link: The connection.
@@ -74,19 +74,19 @@ class RemoteHardware(Hardware):
         self.link.close()
 
     def safe_state(self) -> None:
-        """Make the device safe, also while another call hangs.
+        """Make the device safe, even while another call hangs.
 
         Raises:
-            DeviceError: It failed, or the connection is lost: then the server does it by itself.
+            DeviceError: It failed, or the connection is lost, in which case the server makes the device safe.
         """
         self.link.make_safe()
 
     def describe(self) -> Mapping[str, Any]:
-        """What the device says of itself, with address, settings and version of the server."""
+        """The device's description, with address, settings and version of the server."""
         return self.link.describe()
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
-        """Versions of the served device, and of labseq at its server; that should be the same as here."""
+        """Versions of the served device, and of labseq at its server, which should be the same as here."""
         about = self.link.about
         found: Mapping[str, Any] = self.link.call_if_able("versions", {})
         there = {f"labseq on {about['host']}": (str(about["labseq"]), version("labseq"))}
@@ -99,13 +99,13 @@ class RemoteHardware(Hardware):
     idle_output = known("idle_output", "")
     settling_timeout_s = known("settling_timeout_s", 0.0)
     settle = called_if_able("settle")
-    self_test = called_if_able("self_test")  # else it tests the connection alone
+    self_test = called_if_able("self_test")  # otherwise it only tests the connection
     poll = called_if_able("poll", {})
     check_interlocks = called_if_able("check_interlocks")
 
 
 class RemoteCamera(RemoteHardware, Camera):
-    """A camera on another computer; the times of its frames are on the clock of this one."""
+    """A camera on another computer, with the times of its frames on the session's clock."""
 
     _kind = "camera"
     facts = known("facts", CameraFacts())
@@ -133,9 +133,9 @@ class RemoteStaticTweezers(RemoteHardware, StaticTweezers):
 
 
 class RemoteMobileTweezers(RemoteHardware, MobileTweezers):
-    """Mobile tweezers on another computer: programs travel as tones, and are rendered there.
+    """Mobile tweezers on another computer. Programs are sent as tones, and rendered there.
 
-    The way of the message that starts them comes in addition to their delay.
+    The transfer time of the message that starts them adds to their delay.
     """
 
     _kind = "mobile_tweezers"
@@ -150,7 +150,7 @@ class RemoteMobileTweezers(RemoteHardware, MobileTweezers):
     wait = called("wait")
 
     def timings(self) -> Mapping[str, float]:
-        """Durations of the parts of the last ``prepare()`` there."""
+        """Durations of the parts of the last ``prepare()`` at the server."""
         return self.link.known("timings", {})
 
 

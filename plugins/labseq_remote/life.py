@@ -1,4 +1,4 @@
-"""Whether a connection lives, which all of its parts and the other connections of its run must know."""
+"""Whether a connection is alive, for all its parts and the other connections of its run."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from labseq.plugin import Clock, DeviceError
 
 @dataclass(eq=False)
 class Run:
-    """What the connections of a run have in common.
+    """State that the connections of a run share.
 
     Attributes:
-        lost: Those that are lost and not closed yet; calls over the others are aborted.
-        was_lost: Whether one was lost: then the ends of the others are not waited for.
+        lost: Connections that are lost and not closed yet. Calls over the others are aborted.
+        was_lost: Whether any was lost, after which the others end without waiting.
     """
 
     lost: set[Life] = field(default_factory=set["Life"])
@@ -27,13 +27,13 @@ _runs: weakref.WeakKeyDictionary[Clock, Run] = weakref.WeakKeyDictionary()
 
 
 class Life:
-    """The life of a connection: it is made once, and stays broken when it is.
+    """The life of a connection, which is made once and stays broken if it breaks.
 
     Attributes:
         device: Name of the device, for messages.
-        address: The server.
-        lost: Why the connection is lost; "" while it is not.
-        ended: Set when it was closed.
+        address: Address of the server.
+        lost: Why the connection is lost, or "".
+        ended: Set when the connection was closed.
 
     Args:
         clock: The session's clock, which connections of the same run share.
@@ -48,32 +48,32 @@ class Life:
 
     @property
     def is_over(self) -> bool:
-        """Whether it is lost, or was closed."""
+        """Whether the connection is lost or closed."""
         return bool(self.lost) or self.ended.is_set()
 
     @property
     def run_lost_one(self) -> bool:
-        """Whether this connection or another one of the run was lost."""
+        """Whether this connection or another connection of the run was lost."""
         return self._run.was_lost
 
     def lose(self, why: str) -> None:
-        """It is lost, unless it was closed; the first reason counts."""
+        """Record that the connection is lost, unless it was closed. The first reason counts."""
         if not self.ended.is_set():
-            self.lost = self.lost or f"the connection is lost: {why}; its computer makes the device safe"
+            self.lost = self.lost or f"the connection is lost: {why} (its computer makes the device safe)"
             self._run.lost.add(self)
             self._run.was_lost = True
 
     def end(self) -> None:
-        """It was closed."""
+        """Record that the connection was closed."""
         self.ended.set()
         self._run.lost.discard(self)
 
     def failure(self, text: str = "") -> DeviceError:
-        """An error of the device, by default that its connection is lost or closed."""
+        """An error of the device, by default about its lost or closed connection."""
         text = text or self.lost or "the connection is closed"
         return DeviceError(self.device, f"{text} (at {self.address})")
 
     def failure_of_another(self) -> DeviceError | None:
-        """That another connection of the run is lost; None if none is."""
+        """The error for another lost connection of the run, or None."""
         others = [life for life in tuple(self._run.lost) if life is not self]
         return others[0].failure() if others else None

@@ -1,4 +1,4 @@
-"""The connection of a driver, made when it is first needed, and what travels over it."""
+"""The connection of a driver, made when it is first needed, and the calls over it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from labseq_remote.settings import RemoteSettings
 
 
 class Link:
-    """The connection of a driver: made when it is first needed, again after it was closed.
+    """The connection of a driver, made when it is first needed, and again after it was closed.
 
     Args:
-        settings: Where the device is.
+        settings: Address and name of the device, and key of its server.
         context: The driver's context.
         kind: Kind of the device.
     """
@@ -46,7 +46,7 @@ class Link:
         """Call a method of the open device.
 
         Raises:
-            DeviceError: It is not open, or the connection is lost.
+            DeviceError: The device is not open, or the connection is lost.
         """
         if not self.is_open:
             raise DeviceError(self.name, f"it is not open (at {self.settings.address})")
@@ -58,13 +58,13 @@ class Link:
 
     @property
     def about(self) -> dict[str, Any]:
-        """What the server says about itself and its driver."""
+        """Facts about the server and its driver."""
         if not self._about:
             self.connect()
         return self._about
 
     def known(self, name: str, default: Any) -> Any:
-        """The value of a property, as it was after the last call."""
+        """The value of a property after the last call."""
         if not self._about:
             self.connect()
         return self._state.get(name, default)
@@ -92,7 +92,7 @@ class Link:
         self.is_open = False
         connection = self.connect()
         try:
-            if not connection.is_hanging:  # else the server closes the device
+            if not connection.is_hanging:  # otherwise the server closes the device
                 connection.call("close", stoppable=False)
         finally:
             self.end()
@@ -104,7 +104,7 @@ class Link:
             connection.close()
 
     def describe(self) -> dict[str, Any]:
-        """What the device says of itself, and where it is."""
+        """The device's description, with its address."""
         about = self.about
         remote = {
             "address": self.settings.address,
@@ -123,7 +123,7 @@ class Linked(Protocol):
 
 
 def called(name: str) -> Any:
-    """A method that is carried out at the server; its meaning is that of the role."""
+    """A method that is carried out at the server, with the role's meaning."""
 
     def method(driver: Linked, /, *args: Any, **named: Any) -> Any:
         return driver.link.call(name, *args, **named)
@@ -133,7 +133,7 @@ def called(name: str) -> Any:
 
 
 def called_if_able(name: str, default: Any = None) -> Any:
-    """The same, of an optional method; without it the default is returned."""
+    """An optional method that is carried out at the server. Without it the default is returned."""
 
     def method(driver: Linked) -> Any:
         return driver.link.call_if_able(name, default)
@@ -143,5 +143,5 @@ def called_if_able(name: str, default: Any = None) -> Any:
 
 
 def known(name: str, default: Any) -> Any:
-    """A property, as it was at the server after the last call."""
+    """A property with its value at the server after the last call."""
     return property(lambda driver: driver.link.known(name, default))

@@ -1,4 +1,4 @@
-"""Where a device is, and the key of its server."""
+"""Address and name of a remote device, and the key of its server."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def _address(value: str) -> str:
         wire.parse_address(value)
     except ValueError as error:
         raise setting_error(
-            f"'{value[:60]}' is not an address", "tcp://HOST:PORT, as tcp://camera-pc:5760"
+            f"'{value[:60]}' is not an address", "tcp://HOST:PORT, such as tcp://camera-pc:5760"
         ) from error
     return value
 
@@ -24,21 +24,21 @@ class RemoteSettings(Settings):
     """The server of a device, its name there, and its key."""
 
     address: Annotated[str, AfterValidator(_address)] = Field(
-        description="address of the server, as `labseq serve-devices` prints it: tcp://HOST:PORT"
+        description="address of the server, as `labseq serve-devices` prints it (tcp://HOST:PORT)"
     )
     device: Text = Field(description="role or name of the device in the profile of its computer")
     server_key: Text | None = Field(
-        default=None, description="name of the server's public key in the folder `known`; by default its host"
+        default=None, description="name of the server's public key in the folder `known` (default: the host)"
     )
 
     @property
     def host(self) -> str:
-        """The server."""
+        """Host of the server."""
         return wire.parse_address(self.address)[0]
 
     @property
     def port(self) -> int:
-        """Its port."""
+        """Port of the server."""
         return wire.parse_address(self.address)[1]
 
     @property

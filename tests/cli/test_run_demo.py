@@ -43,7 +43,7 @@ def test_first_look(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     (run_dir,) = here.glob("data/*/*")
     assert labseq.open_run(run_dir).record["name"] == "compact-225"
-    assert "no device is used" in out
+    assert "No device is used" in out
     assert "Each of 1 shot loads atoms at random into 20 x 20 tweezers" in out
     assert "an array of 15 x 15 in up to 10 cycles" in out
     assert f"The data are in {run_dir}" in out
@@ -81,7 +81,7 @@ def test_copies_can_be_run_and_are_never_replaced(capsys: pytest.CaptureFixture[
     ("arguments", "printed"),
     [
         (["--copy", ".", "--shots", "3"], "it only copies files; leave out --shots and --output"),
-        (["--copy", ".", "--output", "x"], "it runs nothing"),
+        (["--copy", ".", "--output", "x"], "it only copies files"),
         (["--shots", "0"], "shots is 0; expected at least 1"),
         (["compact_225"], "unexpected extra argument"),
     ],

@@ -155,4 +155,4 @@ def test_the_next_run_is_watched_when_one_is_over(
     summaries = [line for line in text.splitlines() if line.startswith("run ")]
     assert [line.split()[1] for line in summaries] == [str(run.writer.run_dir) for run in runs]
     assert "no light" in text
-    assert text.splitlines()[-1].startswith("no longer watched")
+    assert text.splitlines()[-1].startswith("stopped watching")

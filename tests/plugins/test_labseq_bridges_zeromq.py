@@ -116,7 +116,7 @@ def test_what_it_refuses() -> None:
             assert reason(peer.send(text)) == "the request is not a JSON object"
         assert reason(peer.ask("run")) == "request is 'run'; expected go, wait, abort, state"
         assert reason(peer.ask("go", text="1", cycles=3)).startswith("unknown key 'cycles'; 'go' takes")
-        assert reason(peer.ask("go", values=[1])) == "values must be an object: address -> value"
+        assert reason(peer.ask("go", values=[1])) == "values must be an object of address -> value"
         assert reason(peer.ask("wait", timeout_s=-1)) == "timeout_s is -1; expected 0 to 3600 s"
         assert reason(peer.ask("wait", timeout_s=1)) == "call go() first"
         assert "refused" in reason(peer.ask("state"))
@@ -165,4 +165,4 @@ def test_a_missing_token_is_a_mistake_on_one_line() -> None:
     token_file().unlink()
     ended = subprocess.run([*SERVER, "1"], capture_output=True, text=True, check=False)
     assert ended.returncode == 2
-    assert "leader.token'; see --labseq-token, --bind and --port" in ended.stderr
+    assert "leader.token'; check --labseq-token, --bind and --port" in ended.stderr

@@ -117,7 +117,9 @@ def test_frames_of_which_nothing_comes_are_missed_by_their_numbers() -> None:
             lab.clock.sleep(0.01)
             assert lab.camera.connection._stream.pop(WAIT_S) is not None
         lab.camera.trigger()
-        with pytest.raises(TransientError, match=r"frames 1 to 2 were lost from a series of 4: .* have a gap"):
+        with pytest.raises(
+            TransientError, match=r"frames 1 to 2 were lost from a series of 4: .* have a gap"
+        ):
             lab.camera.read(1.0)
         last = lab.camera.read(1.0)
         assert (last.number, last.t_start_s) == (3, pytest.approx(first.t_start_s + 0.035))

@@ -108,7 +108,10 @@ def test_the_trigger_line_is_that_of_the_settings() -> None:
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
-        ({"region": {"y": 3, "x": 0, "height": 32, "width": 32}, "binning": 2}, "the nearest possible value is 4"),
+        (
+            {"region": {"y": 3, "x": 0, "height": 32, "width": 32}, "binning": 2},
+            "the nearest possible value is 4",
+        ),
         ({"binning": 8}, "binning is 8; the limit is 1 to 4, in steps of 1"),
         ({"gain": 60.0}, "gain is 60; the limit is 0 to 48"),
         ({"gain_raw": 100}, "gain_raw is 100; the limit is 192 to 1023"),

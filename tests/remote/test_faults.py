@@ -366,7 +366,7 @@ def test_keys(tmp_path: Path, keys: Path, monkeypatch: pytest.MonkeyPatch) -> No
             patch.setattr(wire_of_plugins, "keys_root", lambda: stranger)
             with pytest.raises(DeviceError, match="does not know the key"):
                 with_key().open()
-        with pytest.raises(DeviceError, match="keys do not fit"):  # without keys
+        with pytest.raises(DeviceError, match="keys do not match"):  # without keys
             RemoteDevice(one.settings("instrument"), Context("laser", clock=FakeClock())).open()
         secret = keys / "known" / "here.key"
         withdrawn = secret.read_bytes()

@@ -1,4 +1,4 @@
-"""A labscript device of labseq: BLACS hands values to labseq before each shot, and keeps its answer after it.
+"""A labscript device of labseq. BLACS sends values to labseq before each shot, and stores the answer.
 
 Copy this folder to `user_devices`, under any name, and `labseq_client.py` to `pythonlib`.
 """

@@ -1,10 +1,10 @@
-"""The tab of the device in BLACS; it has no outputs that can be set by hand."""
+"""The tab of the device in BLACS, without outputs to set by hand."""
 
 from blacs.device_base_class import DeviceTab
 
 
 class LabseqTab(DeviceTab):
-    """Starts the worker, which knows host, port and token from the connection table."""
+    """Starts the worker, which reads host, port and token from the connection table."""
 
     def initialise_workers(self):
         """Start the worker."""

@@ -1,4 +1,4 @@
-"""The worker of the device in BLACS, in a process of its own."""
+"""The worker of the device in BLACS, in its own process."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ from labseq_client import Leader
 
 
 class LabseqWorker(Worker):
-    """Sends the values of a shot before it begins, and writes labseq's answer to its file after it.
+    """Sends the values of a shot before the shot, and writes labseq's answer to the shot's file afterwards.
 
     BLACS shows an exception of these methods in the tab, and does not take the shot or puts it back.
     """
@@ -25,17 +25,17 @@ class LabseqWorker(Worker):
         self._h5_file = None
 
     def program_manual(self, values):
-        """Nothing can be set by hand."""
+        """Do nothing, because no output can be set by hand."""
         return {}
 
     def transition_to_buffered(self, device_name, h5_file, initial_values, fresh):
-        """Send the values; labseq refuses wrong ones here, before atoms are loaded."""
+        """Send the values. labseq refuses wrong values here, before atoms are loaded."""
         with h5py.File(h5_file, "r") as file:
             values = json.loads(file[f"devices/{device_name}"].attrs["values"])
         self._h5_file = h5_file
         try:
             self._connected().state()
-        except ConnectionError:  # that run of labseq has ended; another one may wait
+        except ConnectionError:  # that run of labseq has ended, but another one may wait
             self.shutdown()
         leader = self._connected()
         if values:
@@ -47,7 +47,7 @@ class LabseqWorker(Worker):
         try:
             answer = self._leader.wait()
         except OSError:
-            self.shutdown()  # an answer that comes late is not that of the next shot
+            self.shutdown()  # so that a late answer is not taken for the next shot's answer
             raise
         with h5py.File(self._h5_file, "r+") as file:
             group = file.require_group("data").require_group(self.device_name)
@@ -60,16 +60,16 @@ class LabseqWorker(Worker):
         return True
 
     def abort_buffered(self):
-        """Leave the shot: its values are of no use to the next one."""
+        """Disconnect, because the values of this shot are no use for the next."""
         self.shutdown()
         return True
 
     def abort_transition_to_buffered(self):
-        """Likewise."""
+        """Disconnect, as in abort_buffered."""
         return self.abort_buffered()
 
     def shutdown(self):
-        """Disconnect; a shot of labseq goes on."""
+        """Disconnect. A shot of labseq continues."""
         if self._leader is not None:
             self._leader.close()
         self._leader = None

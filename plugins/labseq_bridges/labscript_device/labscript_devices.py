@@ -8,8 +8,8 @@
     go_edge.go_high(t)  # the digital output that is wired to `go` of labseq's timing box
     t += wait("rearranged", t, timeout=2)  # resumed by the edges of `ready` and `failed`
 
-labscript compiles a shot before it is taken. The edges at labseq's timing box therefore say when, and this
-device says what: values before the shot, occupancies after it.
+labscript compiles a shot before it is taken. So the edges at labseq's timing box set the times, and this
+device transfers values before the shot and occupancies after it.
 """
 
 import json
@@ -30,8 +30,8 @@ class Labseq(Device):
             name: Name of the device.
             host: Computer of labseq.
             port: The `port` of its device `tcp_leader`.
-            token_file: Copy of the file `leader.token` on the computer of BLACS; "" for the one of this user.
-            **kwargs: For the base class.
+            token_file: Copy of the file `leader.token` on the computer of BLACS. Default this user's own.
+            **kwargs: Arguments of the base class.
         """
         Device.__init__(self, name, None, None, **kwargs)
         self.BLACS_connection = f"{host}:{port}"
@@ -41,11 +41,11 @@ class Labseq(Device):
         """Set a value for this shot.
 
         Args:
-            address: As for `labseq run --set`; the sequence must allow it with `leader: {may_set: [...]}`.
-            value: A number, or a text such as "5 ms"; as a rule from a global of runmanager.
+            address: As for `labseq run --set`. The sequence must allow it with `leader: {may_set: [...]}`.
+            value: A number, or a text such as "5 ms", usually from a global of runmanager.
 
         Raises:
-            LabscriptError: The value is neither a number, a text nor a list of these.
+            LabscriptError: The value is not a number, a text or a list of these.
         """
         try:
             json.dumps(value)
