@@ -93,7 +93,7 @@ class Dialogue:
 
     @property
     def state(self) -> str:
-        """ "busy" from `go` to the end of its shot, "waiting" while a step waits, else "idle"."""
+        """State "busy" from `go` to the end of its shot, "waiting" while a step waits, else "idle"."""
         if self._go is not None:
             return "busy"
         return "waiting" if self.is_waiting else "idle"

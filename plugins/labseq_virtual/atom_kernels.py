@@ -1,8 +1,8 @@
-"""Kernels of an atom in the light of Gaussian beams: its energy, its start, and its motion.
+"""Kernels for the energy, initial state and motion of an atom in the light of Gaussian beams.
 
 Energies and depths are per mass, in m^2/s^2. Atoms
 of a batch are integrated in single precision, several at once, so that the compiler uses the processor's
-vector instructions: they are the *lanes* of a flat array.
+vector instructions. Each atom is a *lane* of a flat array.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ class Machine(NamedTuple):
 
     Attributes:
         static_depth: Nominal depth of a static tweezer.
-        static_waist: 1/e^2 radius of its intensity, in metres.
-        static_rayleigh: Its Rayleigh length.
+        static_waist: 1/e^2 radius of a static tweezer's intensity, in metres.
+        static_rayleigh: Rayleigh length of a static tweezer.
         mobile_depth: Depth of a mobile tweezer whose tones have their intended power.
-        mobile_waist: Its radius.
-        mobile_rayleigh: Its Rayleigh length.
-        temperature: Of cooled atoms, in kelvin.
-        cooling_hz: Rate at which the cooling light brings atoms back to it; 0 without light.
+        mobile_waist: 1/e^2 radius of a mobile tweezer's intensity, in metres.
+        mobile_rayleigh: Rayleigh length of a mobile tweezer.
+        temperature: Temperature of cooled atoms, in kelvin.
+        cooling_hz: Rate at which the cooling light brings atoms back to ``temperature``. 0 without light.
         noise_hz: Rate at which noise of the intensity heats an atom in a nominal static tweezer.
-        loss: Probability that an atom which was moved is lost, beyond what its flight loses.
-        pair_survival: Probability that of two atoms in one tweezer one is left.
+        loss: Probability that a moved atom is lost, in addition to losses in its flight.
+        pair_survival: Probability that a collision leaves one of two atoms in a tweezer.
     """
 
     static_depth: float
@@ -63,7 +63,7 @@ def pull(
 
     Args:
         x: Distance from the beam's axis, in metres.
-        y: The same in the other direction.
+        y: Distance in the other direction, in metres.
         z: Position along the axis, from the focus.
         depth: Depth per mass.
         waist: 1/e^2 radius of the intensity.
@@ -79,19 +79,19 @@ def pull(
 
 @helper_kernel()
 def energy_in(atom: Atom, x: float, y: float, depth: float, waist: float, rayleigh: float) -> float:
-    """Energy of an atom in one tweezer at a place, negative if that binds it."""
+    """Energy of an atom in one tweezer at a place. Negative if the tweezer binds it."""
     kinetic = 0.5 * (atom.vx * atom.vx + atom.vy * atom.vy + atom.vz * atom.vz)
     return kinetic + pull(atom.x - x, atom.y - y, atom.z, depth, waist, rayleigh)[3]
 
 
 LANES: Final = 8
-"""Atoms that are moved together: those of a vector of 256 bits."""
+"""Number of atoms that are moved together in a vector of 256 bits."""
 N_NUMBERS: Final = 15
 X, Y, Z, VX, VY, VZ, STATIC, AWAY_X, AWAY_Y, WAY_X, WAY_Y, ROW, ROW_CHANGE, COL, COL_CHANGE = (
     LANES * n for n in range(N_NUMBERS)
 )
-"""Where each number of the lanes begins: position relative to the static tweezer, velocity, its depth;
-the mobile tweezer's place relative to the static one and its displacement until the next frame, the factors
+"""Start of each quantity of the lanes. Position relative to the static tweezer, velocity, static depth,
+position of the mobile tweezer relative to the static one, its displacement until the next frame, the factors
 of its depth, and their changes."""
 ZERO, HALF_, ONE, TWO, FARTHEST = (np.float32(x) for x in (0.0, 0.5, 1.0, 2.0, 40.0))
 SHORTER = np.float32(-1.0 / 32.0)
@@ -100,7 +100,7 @@ C2, C3, C4, C5 = (np.float32(1.0 / math.factorial(n)) for n in range(2, 6))
 
 @helper_kernel()
 def fall(q: np.float32) -> np.float32:
-    """exp(-q) for q of at least 0, as (exp(-q / 32))^32 with a series: to 1e-5 at 8, without branches."""
+    """exp(-q) for q of at least 0, as (exp(-q / 32))^32 with a series, to 1e-5 at 8, without branches."""
     u = min(q, FARTHEST) * SHORTER
     e = ONE + u * (ONE + u * (C2 + u * (C3 + u * (C4 + u * C5))))
     e *= e
@@ -114,7 +114,7 @@ def fall(q: np.float32) -> np.float32:
 def pull_fast(
     x: np.float32, y: np.float32, z: np.float32, depth: np.float32, width: np.float32, length: np.float32
 ) -> tuple[np.float32, np.float32]:
-    """As ``pull``, in single precision: what x and y, and what z is multiplied with for the acceleration.
+    """As ``pull``, in single precision. Returns the factors of x and y, and of z, for the acceleration.
 
     ``width`` is 2 / waist^2, ``length`` 1 / rayleigh^2.
     """
@@ -126,7 +126,7 @@ def pull_fast(
 
 @helper_kernel()
 def move(lanes: NDArray[np.float32], machine: Machine, duration_s: float, n_steps: int) -> None:
-    """Move the atoms of all lanes from one frame to the next, in which all light changes evenly: leapfrog."""
+    """Move the atoms of all lanes from one frame to the next, with light that changes evenly, by leapfrog."""
     width_s, length_s = np.float32(2 / machine.static_waist**2), np.float32(1 / machine.static_rayleigh**2)
     width_m, length_m = np.float32(2 / machine.mobile_waist**2), np.float32(1 / machine.mobile_rayleigh**2)
     depth, dt = np.float32(machine.mobile_depth), np.float32(duration_s / n_steps)
@@ -153,14 +153,14 @@ def move(lanes: NDArray[np.float32], machine: Machine, duration_s: float, n_step
 
 
 WIDER = 2.2
-"""Width of the proposed positions relative to a harmonic well's: covers a beam's weaker flanks."""
+"""Width of the proposed positions relative to a harmonic well, to cover a beam's weaker flanks."""
 LONGER = 4.0
-"""The same along the beam."""
+"""Length of the proposed positions along the beam, relative to a harmonic well."""
 
 
 @helper_kernel()
 def draw_place(most: float, atom: Atom, rng: np.random.Generator) -> float:
-    """Draw a position in units of waist and Rayleigh length; returns -U / kT there. See ``draw_atoms``."""
+    """Draw a position in units of waist and Rayleigh length, and return -U / kT there. See ``draw_atoms``."""
     across, along = WIDER / math.sqrt(4.0 * most), LONGER / math.sqrt(2.0 * most)
     while True:
         nx, ny, nz = rng.standard_normal(), rng.standard_normal(), rng.standard_normal()
@@ -177,7 +177,7 @@ def draw_place(most: float, atom: Atom, rng: np.random.Generator) -> float:
 def draw_atom(
     atom: Atom, depth: float, kt: float, waist: float, rayleigh: float, rng: np.random.Generator
 ) -> None:
-    """Draw one atom at the origin, as :func:`draw_atoms` does; ``kt`` is per mass."""
+    """Draw one atom at the origin like :func:`draw_atoms`. ``kt`` is per mass."""
     kt = min(kt, 0.5 * depth)
     bound = draw_place(depth / kt, atom, rng)
     atom.x, atom.y, atom.z = waist * atom.x, waist * atom.y, rayleigh * atom.z
@@ -195,9 +195,9 @@ def draw_atoms(depth: Floats, kt: Floats, waist: float, rayleigh: float, rng: np
 
     Positions have the density ``exp(a) P(a)``, where ``a = -U / kT`` and
     ``P(a) = erf(sqrt(a)) - 2 sqrt(a / pi) exp(-a)`` is the fraction of the Maxwell distribution slow enough
-    to be bound there. They are drawn by rejection from a wider Gaussian. This distribution is stationary;
-    the harmonic one would breathe. In tweezers too shallow for the temperature, the temperature is half of
-    the depth: hotter atoms have evaporated.
+    to be bound there. They are drawn by rejection from a wider Gaussian. This distribution is stationary,
+    while a harmonic one would breathe. In tweezers too shallow for the temperature, the temperature is half
+    the depth, because hotter atoms have evaporated.
 
     Args:
         depth: Depth of each atom's tweezer per mass, (n_atoms,), above 0.
@@ -224,9 +224,9 @@ def ramp_atoms(
     """Move atoms while the depth of their static tweezers changes evenly.
 
     Args:
-        state: The atoms, each relative to its tweezer (n_atoms, 6); changed in place.
+        state: The atoms, each relative to its tweezer (n_atoms, 6). Changed in place.
         depth: Depth of each tweezer at the start (n_atoms,).
-        end: Depth at the end over that at the start.
+        end: Final depth divided by initial depth.
         duration_s: Duration of the ramp.
         waist: 1/e^2 radius of the intensity.
         rayleigh: Rayleigh length.

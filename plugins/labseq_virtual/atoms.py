@@ -15,18 +15,18 @@ ATOMS: Final = np.dtype(
     [("exposure", np.int32), ("row", np.int16), ("col", np.int16), ("lost", np.bool_)],
     metadata={
         "descriptions": {
-            "exposure": "number of the exposure in the shot, from 0: the image of this number",
+            "exposure": "number of the exposure, and so of the image, in the shot, from 0",
             "row": "row of its site",
             "col": "column of its site",
-            "lost": "whether the exposure lost it",
+            "lost": "whether the atom was lost in the exposure",
         }
     },
 )
-"""An atom that was there when an exposure began."""
+"""An atom that existed when an exposure began."""
 
 
 def table_of(exposures: Iterable[tuple[Mask, Mask]]) -> NDArray[Any]:
-    """The atoms of each exposure, :data:`ATOMS`; from where they were, and where they were lost."""
+    """Table :data:`ATOMS` of the atoms of each exposure, from masks of the atoms and of lost atoms."""
     rows = [
         (exposure, row, col, lost[row, col])
         for exposure, (occupied, lost) in enumerate(exposures)
@@ -36,17 +36,17 @@ def table_of(exposures: Iterable[tuple[Mask, Mask]]) -> NDArray[Any]:
 
 
 class Atoms:
-    """The atoms on the sites; all that acts on them changes them in place.
+    """The atoms on the sites, which are changed in place.
 
     Args:
-        occupied: Which sites hold an atom (n_rows, n_cols), C-contiguous; it is kept.
+        occupied: Sites with an atom (n_rows, n_cols), C-contiguous. The array is kept, not copied.
         temperature: Temperature of all atoms.
 
     Attributes:
-        occupied: Which sites hold an atom.
+        occupied: Sites with an atom.
         heat: float64 (n_rows, n_cols), temperatures of the atoms in kelvin, as they would be in static
             tweezers of the nominal depth.
-        since_s: float64 (n_rows, n_cols), the times that these belong to.
+        since_s: float64 (n_rows, n_cols), the times at which ``heat`` was valid.
     """
 
     def __init__(self, occupied: Mask, temperature: float) -> None:
@@ -55,7 +55,7 @@ class Atoms:
         self.since_s: Floats = np.zeros(occupied.shape)
 
     def lose(self, gone: Any) -> int:
-        """Remove the atoms of some sites (n_rows, n_cols); returns how many there were."""
+        """Remove the atoms of some sites (n_rows, n_cols), and return their number."""
         lost = self.occupied & gone
         self.occupied &= ~lost
         return int(np.count_nonzero(lost))

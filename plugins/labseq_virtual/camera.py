@@ -18,17 +18,17 @@ ROOM_K: Final = 293.15
 """Temperature of a sensor whose cooler is off (ours)."""
 
 COLDEST_K: Final = 183.15
-"""Lowest temperature that the cooler reaches: -90 degC (ours)."""
+"""Lowest temperature that the cooler reaches, -90 degC (ours)."""
 
 SWING: Final = 0.6
-"""Phase of the oscillation per time constant, in radians (ours): it overshoots by exp(-pi / 0.6), 0.5 %."""
+"""Phase of the oscillation per time constant, in radians (ours). It overshoots by exp(-pi / 0.6), 0.5 %."""
 
 
 class Cooler:
     """Brings a sensor to a temperature and keeps it there, as a damped oscillation without noise.
 
     Args:
-        setpoint_k: Temperature, in kelvins; one below :data:`COLDEST_K` is not reached.
+        setpoint_k: Temperature, in kelvins. Not reached below :data:`COLDEST_K`.
         clock: The session's clock.
     """
 
@@ -38,7 +38,7 @@ class Cooler:
         self._start_s: float | None = None
 
     def switch_on(self) -> None:
-        """Start cooling; no effect if it is on."""
+        """Start cooling. No effect if it is on."""
         if self._start_s is None:
             self._start_s = self._clock.now()
 
@@ -53,14 +53,14 @@ class Cooler:
 
 
 class VirtualCamera(CameraDriver):
-    """Frames of the simulation, with the timing and error behaviour of a real camera.
+    """Takes frames of the simulation, with the timing and errors of a real camera.
 
     A frame can be read when its exposure and read-out have passed on the clock. The shutter is open
-    and the EM gain is on in a series only. The cooler runs from the first ``open()`` on, even in the
-    safe state and when the camera is closed: as with real cameras, warming up takes longer than a run.
+    and the EM gain is on only during a series. The cooler runs from the first ``open()`` on, even in the
+    safe state and when the camera is closed, because warming up takes longer than a run, as in reality.
 
     Args:
-        settings: Region, binning, read-out time, EM gain, cooling, simulated failures.
+        settings: Region, binning, read-out time, EM gain, cooling and simulated failures.
         context: Clock, random numbers and the simulation.
 
     Raises:
@@ -102,19 +102,19 @@ class VirtualCamera(CameraDriver):
         return self._settings.facts(self._readout_s, self._frame_shape, triggers, em_gain=em_gain)
 
     def warm(self) -> None:
-        """Compute what all frames have in common, and compile or load their kernels."""
+        """Compute the data shared by all frames, and compile or load their kernels."""
         self._simulation.prepare_sensor(self._mode)
 
     @property
     def settling_timeout_s(self) -> float:
-        """How long cooling may take, in seconds; 0 without cooling."""
+        """Longest time for cooling, in seconds. 0 without cooling."""
         return 0.0 if self._cooling is None else self._cooling.timeout_s
 
     def settle(self) -> None:
         """Wait until the sensor is cold.
 
         Raises:
-            DeviceTimeoutError: It does not reach its temperature in time.
+            DeviceTimeoutError: The sensor does not reach its temperature in time.
             DeviceError: The camera is not open.
         """
         self._check_open()
@@ -179,7 +179,7 @@ class VirtualCamera(CameraDriver):
         self._current = self._idle
 
     def _expose(self, t_start_s: float | None = None, exposure_s: float | None = None) -> None:
-        """Begin the next exposure; where the camera times it by itself, only when a frame is read."""
+        """Begin the next exposure. If the camera times its exposures, it waits until a frame is read."""
         faults = self._settings.faults
         late_s = faults.late_by if self._happens(faults.late) else 0.0
         is_lost = self._happens(faults.lost_in_series)
@@ -188,7 +188,7 @@ class VirtualCamera(CameraDriver):
             self._n_seen += 1
 
     def _mode_of(self, series: Series) -> SensorMode:
-        """The simulation's gain where the camera sets none."""
+        """The mode, with the simulation's gain if the camera sets none."""
         return self._mode if self._mode.em_gain is None else replace(self._mode, em_gain=series.em_gain)
 
     @property
@@ -196,5 +196,5 @@ class VirtualCamera(CameraDriver):
         return ROOM_K if self._cooler is None else self._cooler.temperature_k
 
     def _happens(self, probability: float) -> bool:
-        """Draw a failure; a probability of 0 uses no random number."""
+        """Draw a failure. A probability of 0 uses no random number."""
         return probability > 0 and self._random.shot.random() < probability

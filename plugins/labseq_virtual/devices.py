@@ -22,11 +22,11 @@ from labseq_virtual.settings import DeviceSettings, LinesSettings, SynthesizerSe
 from labseq_virtual.tweezers import VirtualDriver
 
 ROUNDING_S = 1e-9
-"""Tolerance of comparisons of times, in seconds: sums of times are rounded."""
+"""Tolerance for comparing times, in seconds, because sums of times are rounded."""
 
 
 class VirtualLines(VirtualDriver, Lines):
-    """Ideal lines: the simulation receives exactly the compiled program.
+    """Ideal lines, which send exactly the compiled program to the simulation.
 
     Every ``fire`` needs a compiled program and its own ``arm``, so no program is fired by mistake.
     """
@@ -47,7 +47,7 @@ class VirtualLines(VirtualDriver, Lines):
         channels = (
             *range(settings.n_channels),
             *named,
-        )  # a dry run stands in for boxes that name their outputs
+        )  # a dry run replaces boxes that name their outputs
         return LinesFacts(channels, settings.resolution, settings.shortest, settings.max_edges)
 
     def idle(self) -> None:
@@ -63,7 +63,7 @@ class VirtualLines(VirtualDriver, Lines):
         """Check a program and keep it for the next ``fire``.
 
         Raises:
-            LimitError: More edges, or edges closer to one another, than the settings allow.
+            LimitError: More edges, or edges closer together, than the settings allow.
             DeviceError: Not open, or lines that the profile does not declare.
         """
         self._check_open()
@@ -74,7 +74,7 @@ class VirtualLines(VirtualDriver, Lines):
         """Refuse a program that the settings do not allow.
 
         Raises:
-            LimitError: More edges, or edges closer to one another, than the settings allow.
+            LimitError: More edges, or edges closer together, than the settings allow.
             DeviceError: Lines that the profile does not declare.
         """
         known = tuple(spec.name for spec in self._specs)
@@ -97,11 +97,11 @@ class VirtualLines(VirtualDriver, Lines):
         """
         self._check_open()
         if self._compiled is None:
-            raise DeviceError(self._name, "armed, but nothing was compiled; call compile() first")
+            raise DeviceError(self._name, "arm() without a compiled program; call compile() first")
         self._is_armed = True
 
     def fire(self) -> None:
-        """Start the program; returns at once.
+        """Start the program, and return at once.
 
         Raises:
             DeviceError: Not armed, or the last program has not ended.
@@ -109,7 +109,7 @@ class VirtualLines(VirtualDriver, Lines):
         self._check_open()
         now_s = self._clock.now()
         if not self._is_armed or self._compiled is None:
-            raise DeviceError(self._name, "fired, but not armed; call arm() before each fire()")
+            raise DeviceError(self._name, "fire() without arm(); call arm() before each fire()")
         if now_s < self._end_s - ROUNDING_S:
             raise DeviceError(self._name, f"fired during a program that ends at {self._end_s:.6f} s")
         self._is_armed = False
@@ -130,7 +130,7 @@ class VirtualLines(VirtualDriver, Lines):
             raise DeviceTimeoutError(self._name, text, timeout_s)
 
     def safe_state(self) -> None:
-        """Turn all lines off and forget what was compiled."""
+        """Turn all lines off and forget the compiled program."""
         self._compiled, self._is_armed, self._end_s = None, False, 0.0
         if self._is_open:
             self._play(off_program(self._specs))
@@ -148,8 +148,8 @@ class VirtualDevice(Device):
     """Accepts commands and remembers them as values.
 
     The value ``state`` is the last command ("closed" before ``open``, "ready"
-    after it, "safe" in the safe state). Arguments of a command are kept as values
-    of the same name: after ``command("set", power=0.5)``, ``read("power")`` is 0.5.
+    after it, "safe" in the safe state). The arguments of a command become values
+    of the same name. After ``command("set", power=0.5)``, ``read("power")`` is 0.5.
     """
 
     def __init__(self, settings: DeviceSettings, context: Context) -> None:
@@ -164,17 +164,17 @@ class VirtualDevice(Device):
         self._values["state"] = "ready"
 
     def close(self) -> None:
-        """Disconnect; legal in any state."""
+        """Disconnect. Legal in any state."""
         self._is_open = False
         self._values["state"] = "closed"
 
     def safe_state(self) -> None:
-        """Make the output harmless; legal in any state."""
+        """Make the output harmless. Legal in any state."""
         if self._is_open:
             self._values["state"] = "safe"
 
     def check_command(self, name: str, **arguments: Any) -> None:  # noqa: ARG002 - any are kept
-        """Refuse a command that the settings do not list, if they list any.
+        """Refuse a command that the settings do not list. Without a list, any command is accepted.
 
         Raises:
             DeviceError: An unknown command.
@@ -214,7 +214,7 @@ class VirtualDevice(Device):
 
 
 DIMENSIONS: Final[Mapping[str, str]] = {"frequency": "frequency", "phase": "angle", "shift": "angle"}
-"""Values of the synthesizer, and what they are."""
+"""Values of the synthesizer -> their dimensions."""
 
 
 class VirtualSynthesizer(VirtualDriver, Device):
@@ -231,19 +231,19 @@ class VirtualSynthesizer(VirtualDriver, Device):
         self._tune({name: getattr(self._settings, name) for name in DIMENSIONS})
 
     def safe_state(self) -> None:
-        """Do nothing: a line switches what it drives."""
+        """Do nothing, because a line switches the drive."""
 
     def check_command(self, name: str, **arguments: Any) -> None:
         """Refuse an unknown command or argument, or one with another unit, with a ``DeviceError``."""
         self._in_si(name, arguments)
 
     def command(self, name: str, **arguments: Any) -> None:
-        """Set values; raises ``DeviceError`` if it is not open, and as ``check_command``."""
+        """Set values. Raises ``DeviceError`` if it is not open, and like ``check_command``."""
         self._check_open()
         self._tune({**self._values, **self._in_si(name, arguments)})
 
     def read(self, name: str) -> float:
-        """A value in SI; raises ``DeviceError`` if it is unknown or never was open."""
+        """A value in SI units. Raises ``DeviceError`` if it is unknown or the device never was open."""
         if name not in self._values:
             raise unknown_name(self._name, "value", name, [*self._values])
         return self._values[name]
@@ -254,14 +254,14 @@ class VirtualSynthesizer(VirtualDriver, Device):
 
     def _tune(self, values: dict[str, float]) -> None:
         self._values = values
-        # a simulation of a lab's own need not have atoms with two levels
+        # a lab's own simulation need not have atoms with two levels
         tune = getattr(self._simulation, "tune", None)
         if tune is not None:
             tune(self._name, values)
 
     def _in_si(self, command: str, arguments: Mapping[str, Any]) -> dict[str, float]:
-        """The arguments as numbers; text has a unit."""
-        from labseq.plugin.units import parse_quantity  # only where a step sets values
+        """The arguments as numbers in SI units. Text has a unit."""
+        from labseq.plugin.units import parse_quantity  # only needed if a step sets values
 
         if command != "set":
             raise unknown_name(self._name, "command", command, ["set"])

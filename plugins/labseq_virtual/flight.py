@@ -1,7 +1,7 @@
-"""Atoms that fly in the light of the mobile tweezers: of a tone program, or of a played RF output.
+"""Atoms that fly in the light of the mobile tweezers, from a tone program or a played RF output.
 
 The tweezers are the crossings of the row tones and the column tones that are on. The purpose of a segment
-(its kind, its batch) is ignored: only tones count, so a wrong program has the effect that it would have in
+(its kind, its batch) is ignored. Only tones count, so a wrong program has the same effect as in
 the lab.
 
 Energies and depths inside are per mass of the atom, in m^2/s^2.
@@ -50,9 +50,9 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 DARK: Final = 0.1
-"""Fraction of the full depth below which the tweezers of a batch have let go of their atoms (ours)."""
+"""Fraction of the full depth below which the tweezers of a batch no longer hold atoms (ours)."""
 SLEW_HZ: Final = 4e6
-"""Largest deviation of a tone from its extrapolated frequency in a transit time (ours: 1100 um/ms at
+"""Largest deviation of a tone from its extrapolated frequency in a transit time (ours, 1100 um/ms at
 1.6 MHz per site)."""
 
 _FATE: Final = f"S{max(map(len, FATES))}"
@@ -73,22 +73,22 @@ FLIGHTS: Final = np.dtype(
     ],
     metadata={
         "descriptions": {
-            "held_s": "when a mobile tweezer first held the atom, from the start of the shot; nan: never",
-            "from_row": "row of its site before",
-            "from_col": "column of its site before",
-            "to_row": "row of the site that it came to, if it was kept",
-            "to_col": "column of the site that it came to, if it was kept",
+            "held_s": "when a mobile tweezer first held the atom, from the start of the shot (nan if never)",
+            "from_row": "row of its site before the flight",
+            "from_col": "column of its site before the flight",
+            "to_row": "row of its final site, if it was kept",
+            "to_col": "column of its final site, if it was kept",
             "offset_m": "how far the tweezer was from the site when it first held the atom",
             "depth_K": "greatest depth of the tweezer",
             "fate": "kept, or the cause of the loss: ejected, collision, transport, hand_over or program",
-            "lost_s": "when it was lost, from the start of the shot; nan: never",
+            "lost_s": "when it was lost, from the start of the shot (nan if never)",
             "lost_row": "row where it was lost, in sites",
             "lost_col": "column where it was lost, in sites",
         }
     },
 )
-"""The path of an atom that a mobile tweezer held, or that was lost: "ejected" beyond the grid, in a
-"collision" with another, fallen out of its tweezer in "transport", or by the transport loss, "hand_over"."""
+"""The path of an atom that was held by a mobile tweezer or lost. Causes are "ejected" beyond the grid, a
+"collision" with another atom, falling out in "transport", and the transport loss, "hand_over"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +105,11 @@ class RunningProgram:
 
     @property
     def t_end_s(self) -> float:
-        """Time of its end."""
+        """Time of the program's end."""
         return self.t_start_s + self.program.total_duration_s
 
     def segment_at(self, t_s: float) -> tuple[int, float]:
-        """The segment that is played at a time, and for how long; that after the last at the end."""
+        """The segment played at a time, and its elapsed time. After the end, one past the last segment."""
         joint_s = self.program.joint_s
         k = int(np.searchsorted(joint_s[1:], t_s - self.t_start_s, side="right"))
         return k, max(0.0, t_s - self.t_start_s - joint_s[k])
@@ -117,7 +117,7 @@ class RunningProgram:
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What acts on the atoms during a program beside the tweezers.
+    """Influences on the atoms during a program, in addition to the tweezers.
 
     Attributes:
         loss_factor: Factor on the transport loss.
@@ -157,7 +157,7 @@ class Flights:
         """Check that :func:`labseq_virtual.rf_analysis.track_tones` can resolve the tones of the sites.
 
         Raises:
-            LimitError: They are too close, or move too fast, for the transit time of the sound.
+            LimitError: The tones are too close, or move too fast, for the transit time of the sound.
         """
         check_resolvable(self._grid, self._motion, self._light.transit_time)
 
@@ -183,18 +183,18 @@ class Flights:
         conditions: Conditions = Conditions(),
         until_s: float = math.inf,
     ) -> Counter[str]:
-        """Move the atoms by a program, whose tones are played exactly as stated.
+        """Move the atoms by a program, whose tones are played exactly.
 
         Args:
-            atoms: The atoms; changed in place.
+            atoms: The atoms. Changed in place.
             running: The program.
             depth: float64 (n_rows, n_cols), depths of the static tweezers relative to the nominal one.
             rng: Random numbers of the shot.
-            conditions: What else acts on the atoms.
-            until_s: When all tones go off, if that is before the end of the program.
+            conditions: Other influences on the atoms.
+            until_s: Time at which all tones go off, if before the end of the program.
 
         Returns:
-            Number of atoms lost by each cause that lost any.
+            Number of lost atoms by cause, only for causes with losses.
         """
         from labseq_virtual.flight_kernels import fly_in_program
         from labseq_virtual.light_kernels import FRAMES_PER_TRANSIT
@@ -224,7 +224,7 @@ class Flights:
         rng: np.random.Generator,
         conditions: Conditions = Conditions(),
     ) -> Counter[str]:
-        """Move the atoms in the light of a pulse that the outputs played; arguments as ``carry_program``."""
+        """Move the atoms in the light of a pulse that the outputs played. Arguments as ``carry_program``."""
         from labseq_virtual.flight_kernels import fly_in_light
 
         n_lost, numbers = np.zeros(len(FATES), np.int64), machine(self._settings, conditions)
@@ -241,7 +241,7 @@ class Flights:
     def find_tones(self, pulse: RfPulse) -> Iterator[tuple[tuple[Floats, ...], Floats]]:
         """Positions (in sites) and depth factors of row and column tones, and the times of the frames.
 
-        Those of one batch after the other: batches without a pause are separated by the dark between them.
+        Yields one batch after the other. Batches without a pause are separated by the dark between them.
         """
         tracks_of_axes: list[Tracks] = []
         for axis, spans in enumerate((pulse.rows, pulse.columns)):
@@ -277,7 +277,7 @@ class Flights:
         return sites
 
     def _tones(self, program: ToneProgram, index: int) -> NDArray[Any]:
-        """The tones of all segments of an axis, (n_tones,); see :class:`labseq_virtual.records.Tone`."""
+        """The tones of all segments of an axis (n_tones,), see :class:`labseq_virtual.records.Tone`."""
         axis, full = (program.row, program.column)[index], self._full[index]
         sites = np.arange(len(full))
         tones = np.empty(len(axis.start_hz), TONE)
@@ -310,13 +310,13 @@ def machine(settings: SimulationSettings, conditions: Conditions) -> tuple[float
 
 
 def _cut(tones: NDArray[Any], course: FrequencyCourse, u: float) -> None:
-    """End the tones of a segment after a fraction u of it."""
+    """End the tones of a segment after a fraction u of the segment."""
     tones["end"] = tones["start"] + (tones["end"] - tones["start"]) * course.fraction(u)
     tones["power_end"] = tones["power_start"] + (tones["power_end"] - tones["power_start"]) * u
 
 
 def _settle(atoms: Atoms, sites: NDArray[Any], n_lost: NDArray[np.int64]) -> Counter[str]:
-    """Take over the atoms from the sites; returns the number of atoms lost by each cause."""
+    """Take over the atoms from the sites, and return the number of atoms lost by each cause."""
     atoms.occupied[...] = sites["atom"]
     atoms.heat[...], atoms.since_s[...] = sites["heat"], sites["since_s"]
     causes: dict[str, int] = dict(zip(FATES[1:], n_lost[1:].tolist(), strict=True))
@@ -324,7 +324,7 @@ def _settle(atoms: Atoms, sites: NDArray[Any], n_lost: NDArray[np.int64]) -> Cou
 
 
 def _table(flights: NDArray[Any]) -> NDArray[Any]:
-    """The rows of :data:`FLIGHTS` of the atoms that were held or lost."""
+    """The rows of :data:`FLIGHTS` for atoms that were held or lost."""
     flights = flights[~np.isnan(flights["held_s"]) | (flights["fate"] > 0)]
     table = np.zeros(len(flights), FLIGHTS)
     for name in ("held_s", "from_row", "from_col", "to_row", "to_col", "lost_s", "lost_row", "lost_col"):
@@ -343,7 +343,7 @@ def _light(depths: list[Floats]) -> Floats:
 
 
 def _batches(bright: Mask) -> list[slice]:
-    """The frames of each batch: cut in the middle of the dark between two that are bright."""
+    """The frames of each batch, cut in the middle of the dark between two batches."""
     edges = np.flatnonzero(np.diff(bright, prepend=False, append=False))
     cuts = [0, *((edges[1:-1:2] + edges[2::2]) // 2).tolist(), len(bright) - 1]
     return [slice(first, last + 1) for first, last in pairwise(cuts)]

@@ -1,11 +1,11 @@
 """Kernels that integrate the motion of atoms in the light of static and mobile tweezers.
 
-Energies and depths are per mass, in m^2/s^2. Arguments that occur in several kernels:
+Energies and depths are per mass, in m^2/s^2. These arguments occur in several kernels:
 
 - ``atom``: position and velocity, :class:`labseq_virtual.records.Atom`.
-- ``plane``: where the sites are, :class:`labseq_virtual.records.Plane`.
+- ``plane``: positions of the sites, :class:`labseq_virtual.records.Plane`.
 - ``rows``, ``cols``: the tones from frame to frame, :func:`labseq_virtual.light_kernels.course_of`.
-- ``flights``, ``state``: the atoms near which a tweezer came so far, :class:`Flight` and ``atom`` of each.
+- ``flights``, ``state``: :class:`Flight` and ``atom`` of each atom that a tweezer has come near so far.
 - ``sites``: the sites and their atoms, ``Site`` (n_rows, n_cols).
 - ``machine``: the constants, :class:`Machine`.
 """
@@ -64,54 +64,54 @@ from labseq_virtual.records import ATOM, SITE, TONE, Atom, Plane, Site, record, 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Records = Any
-"""An array of records: numpy has no type for one that knows its columns."""
+"""An array of records. numpy has no type with the columns."""
 
 NEAR = 2.6
-"""Distance in waists beyond which a tweezer is neglected: there it has 1.4e-6 of its depth."""
+"""Distance in waists beyond which a tweezer is neglected, where it has 1.4e-6 of its depth."""
 GONE = 2.0
 """Distance in waists from every tweezer beyond which an unbound atom counts as lost (ours)."""
 HIGH = 4.0
 """Distance from the plane in Rayleigh lengths beyond which an unbound atom counts as lost (ours)."""
 BLOCK = 0.15
-"""Way of the fastest tone, in sites, during which an atom feels the same two tweezers."""
+"""Distance moved by the fastest tone, in sites, during which an atom feels the same two tweezers."""
 BLOCK_S = 20e-6
-"""The longest time of that."""
+"""Longest time during which an atom feels the same two tweezers."""
 STEPS = 15.0
-"""Least number of steps of the integration in a period of the deepest tweezer."""
+"""Minimum number of integration steps per period of the deepest tweezer."""
 LIT = 0.2
-"""Factor of the depth above which a tone counts as on when its tweezer is cut off; half the amplitude is a
+"""Factor of the depth above which a tone counts as on when its tweezer is cut off. Half the amplitude is a
 quarter. A ramp of 60 us is below it by then."""
 COLDEST = 0.1
-"""Least temperature after a flight over that before it: the energies of one atom scatter."""
+"""Smallest ratio of temperatures after and before a flight, because the energies of one atom scatter."""
 
 
 KEPT, HAND_OVER, TRANSPORT, COLLISION, EJECTED, PROGRAM, FLYING, SETTLED = range(8)
-"""Places in ``FATES``; the last two only on the way: a settled atom is bound by its static tweezer alone, and
-is not moved until a mobile one comes near."""
+"""Places in ``FATES``. The last two are temporary. A settled atom is bound only by its static tweezer, and
+is not moved until a mobile tweezer comes near."""
 
 
 class Flight:
-    """An atom near which a mobile tweezer comes; nan where it did not happen.
+    """An atom near which a mobile tweezer comes. Times are nan for events that did not happen.
 
     Attributes:
-        fate: What became of it.
-        from_row: Row of its site before.
-        from_col: Column of it.
+        fate: Fate of the atom.
+        from_row: Row of its site before the flight.
+        from_col: Column of its site before the flight.
         to_row: Row of the nearest site afterwards.
-        to_col: Column of it.
-        held_s: When a mobile tweezer first held it.
-        offset: How far that tweezer was from the nearest site, in metres.
+        to_col: Column of the nearest site afterwards.
+        held_s: Time when a mobile tweezer first held it.
+        offset: Distance of that tweezer from the nearest site, in metres.
         depth: Greatest depth of the tweezer.
-        lost_s: When the atom was lost.
-        lost_row: Where, in sites.
-        lost_col: Likewise.
-        heat: Its temperature before, as it would be in a static tweezer of nominal depth.
-        energy: Its energy at the start, above the bottom, divided by the root of its site's relative depth.
-        glow_s: Sum over the time in mobile tweezers, relative to the nominal static depth.
-        row: Track of the row tone of its tweezer; -1: no tweezer is near.
+        lost_s: Time when the atom was lost.
+        lost_row: Row where the atom was lost, in sites.
+        lost_col: Column where the atom was lost, in sites.
+        heat: Temperature before the flight, converted to a static tweezer of nominal depth.
+        energy: Initial energy above the bottom, divided by the root of the site's relative depth.
+        glow_s: Time integral of the mobile tweezers' depth, relative to the nominal static depth.
+        row: Track of the row tone of its tweezer. -1 if no tweezer is near.
         col: Track of the column tone.
-        until_s: When a tweezer last held it.
-        cut_s: When this tweezer was cut off; inf: it was not.
+        until_s: Time when a tweezer last held it.
+        cut_s: Time when this tweezer was cut off. inf if it was not.
     """
 
     fate: int
@@ -153,7 +153,7 @@ def place_of(row: float, col: float, plane: Plane) -> tuple[float, float]:
 
 @helper_kernel()
 def site_at(atom: Atom, plane: Plane, shape: tuple[int, int]) -> tuple[int, int, bool]:
-    """Row and column of the site nearest to an atom, and whether the atom is in the grid."""
+    """Row and column of the site closest to an atom, and whether the atom is in the grid."""
     at_row, at_col = sites_of(atom.x, atom.y, plane)
     row, col = round(at_row), round(at_col)
     inside = 0 <= row < shape[0] and 0 <= col < shape[1]
@@ -162,9 +162,9 @@ def site_at(atom: Atom, plane: Plane, shape: tuple[int, int]) -> tuple[int, int,
 
 @helper_kernel()
 def nearest(tones: Floats, k: int, last: int, place: float, guess: int) -> int:
-    """The track nearest to a place, in sites, at frame k or ``last``; -1 if none is on.
+    """The track closest to a place, in sites, at frame k or ``last``. -1 if none is on.
 
-    ``guess`` is taken if it is so close that no other can be closer.
+    ``guess`` is returned if it is so close that no other can be closer.
     """
     if (
         guess >= 0
@@ -185,7 +185,7 @@ def nearest(tones: Floats, k: int, last: int, place: float, guess: int) -> int:
 def find_tweezer(
     flight: Flight, atom: Atom, rows: Floats, cols: Floats, k: int, last: int, plane: Plane, reach: float
 ) -> bool:
-    """Find the mobile tweezer nearest to an atom between two frames; whether one is near."""
+    """Find the mobile tweezer closest to an atom between two frames. Returns whether one is near."""
     row, col = sites_of(atom.x, atom.y, plane)
     flight.row = nearest(rows, k, last, row, flight.row)
     flight.col = nearest(cols, k, last, col, flight.col)
@@ -200,7 +200,7 @@ def find_tweezer(
 
 @helper_kernel()
 def relaxed(heat: float, elapsed_s: float, aim: float, machine: Machine) -> float:
-    """Temperature after a time in a static tweezer: cooled, or heated by the noise of the intensity."""
+    """Temperature after a time in a static tweezer, cooled or heated by intensity noise."""
     if machine.cooling_hz > 0.0:
         return aim + (heat - aim) * math.exp(-elapsed_s * machine.cooling_hz)
     return heat * math.exp(min(elapsed_s * machine.noise_hz, 20.0))
@@ -211,7 +211,7 @@ def wake(
     flight: Flight, atom: Atom, row: int, col: int, site: Site, now_s: float, plane: Plane,
     machine: Machine, rng: np.random.Generator,
 ) -> None:  # fmt: skip
-    """Draw where the atom of a site is in its static tweezer, and how it moves, as a mobile tweezer comes."""
+    """Draw position and velocity of a site's atom in its static tweezer, when a mobile tweezer comes."""
     level = math.sqrt(site.depth / machine.static_depth)
     flight.heat = relaxed(site.heat, max(0.0, now_s - site.since_s), machine.temperature / level, machine)
     waist, rayleigh = machine.static_waist, machine.static_rayleigh
@@ -233,7 +233,7 @@ def wake_around(
     row: float, col: float, flights: Records, state: Records, n: int, awake: Ints, block: int, sites: Records,
     now_s: float, plane: Plane, machine: Machine, rng: np.random.Generator,
 ) -> int:  # fmt: skip
-    """Wake the atoms on the sites around a mobile tweezer; returns the number of flights."""
+    """Wake the atoms on the sites around a mobile tweezer, and return the number of flights."""
     x, y = place_of(row, col, plane)
     reach = NEAR * machine.mobile_waist
     for r in range(max(math.floor(row), 0), min(math.floor(row) + 2, sites.shape[0])):
@@ -253,18 +253,18 @@ def wake_atoms(
     rows: Floats, cols: Floats, k: int, last: int, flights: Records, state: Records, n: int, awake: Ints,
     sites: Records, now_s: float, plane: Plane, machine: Machine, rng: np.random.Generator,
 ) -> int:  # fmt: skip
-    """Wake the atoms on all sites that mobile tweezers are near between two frames.
+    """Wake the atoms on all sites with a mobile tweezer near between two frames.
 
     Args:
         rows: The row tones.
         cols: The column tones.
         k: First frame.
         last: Last frame.
-        flights: Room for the atoms of all sites, of which the first n fly or have settled.
-        state: Likewise.
-        n: Their number.
-        awake: The last block in which a tweezer was near each site (n_rows, n_cols); changed in place.
-        sites: The sites; changed in place: atoms that are woken leave them.
+        flights: Array for the atoms of all sites. The first n fly or have settled.
+        state: Positions and velocities of these atoms.
+        n: Number of atoms that fly or have settled.
+        awake: The last block in which a tweezer was near each site (n_rows, n_cols). Changed in place.
+        sites: The sites. Changed in place, because woken atoms leave them.
         now_s: Time of frame k.
         plane: The plane of the sites.
         machine: The constants.
@@ -277,7 +277,7 @@ def wake_atoms(
         for j in range(len(cols)):
             for frame in (k, last):
                 row, col = rows[i, frame, PLACE], cols[j, frame, PLACE]
-                if (frame == k > 0) or math.isnan(row) or math.isnan(col):  # frame k was the last one before
+                if (frame == k > 0) or math.isnan(row) or math.isnan(col):  # done in the block before
                     continue
                 n = wake_around(row, col, flights, state, n, awake, last, sites, now_s, plane, machine, rng)
     return n
@@ -288,7 +288,7 @@ def must_move(
     flight: Flight, atom: Atom, rows: Floats, cols: Floats, k: int, last: int, sites: Records, plane: Plane,
     machine: Machine,
 ) -> bool:  # fmt: skip
-    """Whether an atom must be integrated from frame k to ``last``; one that need not settles."""
+    """Whether an atom must be integrated from frame k to ``last``. Otherwise it settles."""
     if find_tweezer(flight, atom, rows, cols, k, last, plane, NEAR * machine.mobile_waist):
         flight.fate = FLYING
         return True
@@ -315,7 +315,7 @@ def set_tweezers(
         lanes[COL + i], lanes[COL_CHANGE + i] = cols[c, k, DEPTH], cols[c, k, CHANGE]
         x, y = place_of(rows[r, k, PLACE], cols[c, k, PLACE], plane)
         if math.isnan(x) or math.isnan(y):
-            continue  # likewise
+            continue  # its depth is 0
         lanes[AWAY_X + i], lanes[AWAY_Y + i] = x - origin[i, 0], y - origin[i, 1]
         lanes[WAY_X + i] = rows[r, k, WAY] * plane.x_row + cols[c, k, WAY] * plane.x_col
         lanes[WAY_Y + i] = rows[r, k, WAY] * plane.y_row + cols[c, k, WAY] * plane.y_col
@@ -347,14 +347,14 @@ def move_some(
 
 @helper_kernel()
 def lose(flight: Flight, fate: int, atom: Atom, plane: Plane, t_s: float) -> None:
-    """Record when, where and by what an atom was lost."""
+    """Record time, place and cause of a lost atom."""
     flight.fate, flight.lost_s = fate, t_s
     flight.lost_row, flight.lost_col = sites_of(atom.x, atom.y, plane)
 
 
 @helper_kernel()
 def fall_out(flight: Flight, atom: Atom, plane: Plane, shape: tuple[int, int], t_s: float) -> None:
-    """Lose an atom that no tweezer binds, and say by what."""
+    """Lose an atom that no tweezer binds, and record the cause."""
     inside = site_at(atom, plane, shape)[2]
     fate = PROGRAM if flight.until_s > flight.cut_s - 1.5 * BLOCK_S else TRANSPORT
     lose(flight, fate if inside else EJECTED, atom, plane, t_s)
@@ -365,7 +365,7 @@ def check_atom(
     flight: Flight, atom: Atom, rows: Floats, cols: Floats, k: int, sites: Records, t_s: float,
     lasted_s: float, plane: Plane, machine: Machine,
 ) -> None:  # fmt: skip
-    """See what holds an atom at frame k; it is lost once it is unbound and far from everything."""
+    """Find what holds an atom at frame k. It is lost once it is unbound and far from everything."""
     row, col, _ = site_at(atom, plane, sites.shape)
     x, y = place_of(row, col, plane)
     depth, mobile, to_x, to_y = sites[row, col].depth, 0.0, 0.0, 0.0
@@ -415,9 +415,9 @@ def check_faults(
     flight: Flight, atom: Atom, rows: Floats, row_faults: Ints, cols: Floats, col_faults: Ints, k: int,
     start_s: float, frame_s: float, plane: Plane,
 ) -> None:  # fmt: skip
-    """Note when the tweezer that holds an atom at frame k is cut off; lose an atom whose tones mix.
+    """Record when the tweezer that holds an atom at frame k is cut off. Lose an atom whose tones mix.
 
-    A tone may be cut off when the other one has gone down in a ramp: then the tweezer was off before.
+    A tone may be cut off after the other one was ramped down. Then the tweezer was already off.
     """
     now_s = start_s + k * frame_s
     if flight.fate != FLYING or flight.until_s != now_s:
@@ -434,7 +434,7 @@ def collide(
     state: Records, moving: Ints, flights: Records, plane: Plane, machine: Machine, t_s: float,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
-    """Of two moving atoms within a waist of each other, collisions in the light leave one or none."""
+    """Collisions in the light leave one or none of two moving atoms within a waist of each other."""
     for m in range(len(moving)):
         for n in range(m):
             i, j = moving[m], moving[n]
@@ -451,7 +451,7 @@ def collide(
 
 @helper_kernel()
 def ways_of(rows: Floats, cols: Floats) -> Floats:
-    """Way of the fastest tone from each frame to the next, in sites (n_frames,)."""
+    """Distance moved by the fastest tone from each frame to the next, in sites (n_frames,)."""
     ways = np.zeros(rows.shape[1])
     for axis in (rows, cols):
         for j in range(len(axis)):
@@ -472,7 +472,7 @@ def greatest(tones: Floats) -> float:
 
 @helper_kernel()
 def steps_of(machine: Machine, factor: float, frame_s: float) -> int:
-    """Steps from frame to frame; ``factor``: that of the depth of the deepest tweezer."""
+    """Number of steps from frame to frame. ``factor`` is the depth factor of the deepest tweezer."""
     depth, waist = machine.static_depth + factor * machine.mobile_depth, machine.mobile_waist
     return math.ceil(STEPS * frame_s * math.sqrt(depth) / (math.pi * waist))
 
@@ -492,7 +492,7 @@ def land(
     flight: Flight, atom: Atom, sites: Records, plane: Plane, machine: Machine, end_s: float,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
-    """Decide the fate of an atom that is left at the end: its nearest site keeps it, if it binds it."""
+    """Decide the fate of an atom that is left at the end. Its nearest site keeps it if it binds it."""
     row, col, inside = site_at(atom, plane, sites.shape)
     x, y = place_of(row, col, plane)
     depth = sites[row, col].depth
@@ -514,7 +514,7 @@ def land(
 def put_down(
     flights: Records, state: Records, sites: Records, plane: Plane, end_s: float, lost: Ints
 ) -> None:
-    """Put the atoms on their sites, two on one are lost, and count the losses."""
+    """Put the atoms on their sites, lose pairs on the same site, and count the losses."""
     for i in range(len(flights)):
         for j in range(i if flights[i].fate == KEPT else 0):
             a, b = flights[i], flights[j]
@@ -545,23 +545,23 @@ def fly(
     """Move the atoms in the light of a batch.
 
     Between frames, positions and depths change evenly. An atom feels its nearest static tweezer and its
-    nearest mobile one. One that its static tweezer binds is not moved while no mobile one is near.
+    nearest mobile one. Without a mobile tweezer near, an atom bound by its static tweezer is not moved.
 
     Args:
-        sites: The sites and their atoms; changed in place.
+        sites: The sites and their atoms. Changed in place.
         rows: The row tones.
-        row_faults: Their faults, see ``CUT`` (n_row_tones, 2).
+        row_faults: Faults of the row tones, see ``CUT`` (n_row_tones, 2).
         cols: The column tones.
-        col_faults: Their faults.
+        col_faults: Faults of the column tones.
         start_s: Time of the first frame.
         frame_s: Time from frame to frame.
         numbers: The numbers of :class:`Machine`.
         axes: The numbers of :class:`labseq_virtual.records.Plane`.
         rng: Random numbers of the shot.
-        lost: Number of atoms of each of ``FATES`` (6,); changed in place.
+        lost: Number of atoms of each of ``FATES`` (6,). Changed in place.
 
     Returns:
-        What happened to the atoms that tweezers came near (n_atoms,).
+        Flights of the atoms that tweezers came near (n_atoms,).
     """
     machine, plane = Machine(*numbers), Plane(*axes)
     flights: Records = np.empty(sites.size, FLIGHT)
@@ -608,7 +608,7 @@ def fly_in_light(
     sites: Records, rows: Floats, row_depth: Floats, cols: Floats, col_depth: Floats, start_s: float,
     frame_s: float, numbers: tuple[float, ...], axes: tuple[float, ...], rng: np.random.Generator, lost: Ints,
 ) -> Records:  # fmt: skip
-    """Move the atoms in the light of tones: places (sites) and depth factors (n_tracks, n_frames)."""
+    """Move the atoms in the light of tones with positions in sites and depth factors (n_tracks, n_frames)."""
     row_faults, col_faults = np.full((len(rows), 2), NEVER), np.full((len(cols), 2), NEVER)
     of_rows, of_cols = course_of(rows, row_depth), course_of(cols, col_depth)
     return fly(sites, of_rows, row_faults, of_cols, col_faults, start_s, frame_s, numbers, axes, rng, lost)
@@ -627,21 +627,21 @@ def fly_in_program(
     """Move the atoms in the light of the first segments of a program, batch by batch.
 
     Args:
-        sites: The sites and their atoms; changed in place.
+        sites: The sites and their atoms. Changed in place.
         rows: The row tones of all segments (n_tones,).
-        row_offsets: Where those of each segment begin.
+        row_offsets: Start of each segment in ``rows``.
         cols: The column tones.
-        col_offsets: Likewise.
+        col_offsets: Start of each segment in ``cols``.
         durations_s: Durations of the segments.
         courses: Courses of their frequencies.
         n_segments: Number of segments that are played.
         step_hz: Difference of the frequencies of neighbouring rows, and columns.
-        start_s: When the program starts.
+        start_s: Start of the program.
         frame_s: Time from frame to frame.
         numbers: The numbers of :class:`Machine`.
         axes: The numbers of :class:`labseq_virtual.records.Plane`.
         rng: Random numbers of the shot.
-        lost: Number of atoms of each of ``FATES`` (6,); changed in place.
+        lost: Number of atoms of each of ``FATES`` (6,). Changed in place.
     """
     for first, last in find_batches(rows, row_offsets, cols, col_offsets, n_segments):
         rows_now, row_faults = light_of_axis(

@@ -1,4 +1,4 @@
-"""Kernels that draw frames: integers from tabulated distributions, and photoelectrons onto pixels."""
+"""Kernels that draw integers from tabulated distributions, and photoelectrons onto pixels."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def draw(
     first: int,
     drawn: NDArray[np.uint16] | NDArray[np.int32],
 ) -> None:
-    """One number for each random word: ``first`` plus the word's index in the table."""
+    """Draw one number for each random word, which is ``first`` plus the word's index in the table."""
     for i in range(len(words)):
         drawn[i] = first + place(words[i], edges, starts)
 
@@ -50,7 +50,7 @@ def draw_sums(
     n_each: NDArray[np.int64],
     sums: NDArray[np.int64],
 ) -> None:
-    """Sums of ``n_each`` numbers each; there is one word for every number of every sum."""
+    """Draw sums of ``n_each`` numbers, with one word for every number of every sum."""
     i = 0
     for group in range(len(n_each)):
         total = n_each[group] * first
@@ -70,7 +70,7 @@ def scatter(
     binning: int,
     light: NDArray[np.int32],
 ) -> None:
-    """Count the photoelectrons on each pixel; those outside the frame are ignored.
+    """Count the photoelectrons on each pixel, and ignore those outside the frame.
 
     Args:
         offset: Distance of each from the centre of its spot, (y, x) in pixels of the sensor (n, 2).
@@ -79,7 +79,7 @@ def scatter(
         top: First row of the sensor that is read.
         left: First column.
         binning: Pixels of the sensor per pixel of the frame, along each axis.
-        light: Photoelectrons on each pixel of the frame; added to.
+        light: Photoelectrons on each pixel of the frame. Added to in place.
     """
     height, width = light.shape[0] * binning, light.shape[1] * binning
     i = 0

@@ -1,4 +1,4 @@
-"""Images of atoms: where their spots are, how bright they are, and the frames of an exposure."""
+"""Images of atoms, with positions and brightness of their spots, and the frames of an exposure."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def photoelectrons(
     Args:
         settings: Constants of the optics, and the part of the sensor that is read.
         spots: float64 (n_atoms, 2), (y, x) of each atom's spot on the sensor.
-        mean: float64 (n_atoms,), mean photoelectrons of each.
+        mean: float64 (n_atoms,), mean photoelectrons of each atom.
         rng: Random numbers of the shot.
         binning: Pixels of the sensor per pixel of the frame, along each axis.
 
@@ -98,12 +98,12 @@ def middle(settings: ImageSettings) -> NDArray[np.float64]:
 
 
 def corner_distance(settings: ImageSettings, places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance of places (..., 2) from the middle of the sensor; 1 is its corner."""
+    """Distance of places (..., 2) from the middle of the sensor, where 1 is the corner."""
     return np.linalg.norm(places - middle(settings), axis=-1) / math.hypot(*(np.array(settings.frame) / 2))
 
 
 def _wings(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Positions in wings of width 1 (n, 2): where isotropic light from a point 1 above the plane meets it."""
+    """Positions (n, 2) in wings of width 1, where isotropic light from a point 1 above the plane meets it."""
     cosine = 1.0 - rng.random(n)
     radius = np.sqrt(1 / cosine**2 - 1)
     angle = 2 * np.pi * rng.random(n)
@@ -122,7 +122,7 @@ class Light:
 
     Attributes:
         positions_m: float64 (..., 2), (x, y) in the atom plane, from the grid's centre.
-        mean: float64 (...), mean photoelectrons of each in the exposure of the settings.
+        mean: float64 (...), mean photoelectrons of each tweezer in the settings' exposure.
     """
 
     positions_m: NDArray[np.float64]
@@ -132,14 +132,14 @@ class Light:
 def tweezer_photoelectrons(
     view: View, light: Light, fraction: float, rng: np.random.Generator, binning: int = 1
 ) -> NDArray[np.int32]:
-    """Draw the photoelectrons of tweezers on each pixel that is read: Gaussian spots, with shot noise.
+    """Draw the photoelectrons of tweezers on each pixel that is read, as Gaussian spots with shot noise.
 
-    Vignetting dims them as it does the light of atoms.
+    Vignetting dims them like the light of atoms.
 
     Args:
         view: Constants of the optics, and the part of the sensor that is read.
         light: The tweezers.
-        fraction: What of their light is detected, relative to ``light.mean``.
+        fraction: Detected fraction of their light, relative to ``light.mean``.
         rng: Random numbers of the shot.
         binning: Pixels of the sensor per pixel of the frame, along each axis.
 
@@ -159,7 +159,7 @@ def tweezer_photoelectrons(
 
 
 class Images:
-    """Draws frames of atoms on the sites, all in one mode of the sensor; ``seed``: that of the machine.
+    """Draws frames of atoms on the sites in one mode of the sensor. ``seed`` is the machine's seed.
 
     Raises:
         LimitError: The sensor has no such mode.
@@ -176,7 +176,7 @@ class Images:
         self._sensor = Emccd(view) if view.sensor == "emccd" else Qcmos(view, rng)
 
     def warm(self) -> None:
-        """Compute what all frames have in common."""
+        """Compute the data shared by all frames."""
         self._sensor.warm()
 
     def take(
@@ -190,7 +190,7 @@ class Images:
     ) -> NDArray[np.uint16]:
         """Draw a frame, uint16 (height, width), of atoms that shine for a fraction of the exposure each.
 
-        ``row``, ``col`` and ``shining`` are of shape (n_atoms,); ``tweezers`` is other light on the sensor.
+        ``row``, ``col`` and ``shining`` have the shape (n_atoms,). ``tweezers`` is other light on the sensor.
         """
         view = self._view
         efficiency = self._sensor.quantum_efficiency * exposure_s / view.exposure
@@ -212,7 +212,7 @@ class Exposure:
         self._light_hz = -math.log1p(-settings.imaging_loss) / settings.imaging_loss_exposure
 
     def prepare(self, mode: SensorMode) -> None:
-        """Compute what all frames of a mode have in common.
+        """Compute the data shared by all frames of a mode.
 
         Raises:
             LimitError: The sensor has no such mode.
@@ -228,18 +228,18 @@ class Exposure:
         light_on: float = 1.0,
         tweezer_power: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.uint16], Counter[str]]:
-        """Take a frame; imaging light heats some atoms out of their tweezers, and they shine until then.
+        """Take a frame. Imaging light heats some atoms out of their tweezers, and they shine until then.
 
-        A closed shutter keeps the light from the sensor only, not from the atoms.
+        A closed shutter keeps the light only from the sensor, not from the atoms.
 
         Args:
-            occupied: bool (n_rows, n_cols), sites that hold an atom; changed in place.
+            occupied: bool (n_rows, n_cols), sites that hold an atom. Changed in place.
             exposure_s: Exposure time, in seconds.
             random: Random numbers of the shot.
             mode: How the sensor is exposed and read.
-            light_on: Fraction of the exposure with imaging light; at 0 there is no stray light either.
-            tweezer_power: float64 (n_rows, n_cols), power of the static tweezers, which a closed shutter
-                keeps from the sensor, too.
+            light_on: Fraction of the exposure with imaging light. At 0 there is no stray light either.
+            tweezer_power: float64 (n_rows, n_cols), power of the static tweezers, whose light a closed
+                shutter also keeps from the sensor.
 
         Returns:
             The frame, uint16 (height, width), read-only, and the numbers of atoms lost to imaging and vacuum.
@@ -262,7 +262,7 @@ class Exposure:
         return image, Counter(imaging=n_by_light, vacuum=n_lost - n_by_light)
 
     def _images_of(self, mode: SensorMode) -> Images:
-        """The images of a mode; all share the seed, so a region shows exactly that part of the sensor."""
+        """The images of a mode. All share the seed, so a region shows exactly that part of the sensor."""
         if mode not in self._images:
             self._images[mode] = Images(self._settings.image, self._grid, self._seed, mode)
         return self._images[mode]

@@ -24,10 +24,10 @@ JUMPS: Final = np.dtype(
     ],
     metadata={
         "descriptions": {
-            "t_s": "when, from the start of the shot",
-            "kind": "phase, of a tone; or depth, of a tweezer",
-            "row": "row in sites; nan for the phase of a column's tone",
-            "col": "column in sites; nan for the phase of a row's tone",
+            "t_s": "time from the start of the shot",
+            "kind": "phase (of a tone) or depth (of a tweezer)",
+            "row": "row in sites, nan for the phase of a column's tone",
+            "col": "column in sites, nan for the phase of a row's tone",
             "size": "in rad, or as a fraction of the full depth",
         }
     },
@@ -37,26 +37,26 @@ JUMPS: Final = np.dtype(
 INNER: Final = 3 * HOPS // 4
 OUTER: Final = 2 * HOPS
 """A jump is found by extrapolating fits to the frames from OUTER to INNER before it and from INNER to
-OUTER after it; nearer frames are blurred by the jump itself."""
+OUTER after it. Closer frames are blurred by the jump itself."""
 MIN_RAD: Final = 0.75
-"""Smallest phase jump that is reported (ours): a chirp that changes all the time looks like 0.6 rad."""
+"""Smallest reported phase jump (ours), because a steadily changing chirp looks like 0.6 rad."""
 RESIDUAL_RAD: Final = 0.02
-"""Largest residual of the fits; where it is larger, something else happens, such as a second start."""
+"""Largest residual of the fits. A larger one means something else, such as a second start."""
 CHIRP_RAD: Final = 0.3
-"""Smallest phase that a change of the chirp adds within the inner frames for its time to be known."""
+"""Smallest phase that a change of the chirp must add within the inner frames for its time to be known."""
 MIN_DEPTH: Final = 0.6
-"""Smallest reported change of the depth within a transit time; a ramp of 60 us makes a sixth."""
+"""Smallest reported change of the depth within a transit time. A ramp of 60 us makes a sixth."""
 
 
 def phase_jumps(tracks: Tracks, j: int) -> list[tuple[float, int, float]]:
     """The phase jumps of one of the tones.
 
-    The phase before and the phase after are each fitted by a quadratic in time (constant chirp); the jump
-    is the difference of the two fits. Where the chirp changes too, the difference is taken at the time
+    The phase before and the phase after are each fitted by a quadratic in time (constant chirp). The jump
+    is the difference of the two fits. If the chirp also changes, the difference is taken at the time
     when both have the same frequency, because the tweezer's motion is continuous.
 
     Returns:
-        Time, frame and size in rad of each.
+        Time, frame and size in rad of each jump.
     """
     hz, phase = tracks.frequency_hz[:, j], tracks.phase_rad[:, j]
     n_span = 2 * OUTER + 1
@@ -86,14 +86,14 @@ def depth_jumps(depth: Floats) -> list[tuple[int, float]]:
     """The jumps of a tweezer's depth.
 
     Returns:
-        Frame and size of each.
+        Frame and size of each jump.
     """
     change = depth[HOPS:] - depth[:-HOPS]
     return [(k + HOPS // 2, float(change[k])) for k in peaks(np.abs(change), MIN_DEPTH, HOPS)]
 
 
 def peaks(values: Floats, least: float, apart: int) -> list[int]:
-    """Middle of each run of values above ``least``; gaps of at most ``apart`` do not end a run."""
+    """Middle of each run of values above ``least``. Gaps of at most ``apart`` do not end a run."""
     above = np.flatnonzero(values > least)
     if not len(above):
         return []
@@ -119,9 +119,9 @@ def find_jumps(
 
     Args:
         tracks_of_axes: Tones of the rows and of the columns.
-        sites: Their positions in sites, (n_frames, n_tones) each.
-        depths: Their factors of the full depth, likewise.
-        bright: bool (n_frames,), whether a tweezer is deep; atoms do not feel a phase that jumps in the dark.
+        sites: Positions of these tones in sites, (n_frames, n_tones) each.
+        depths: Depth factors of these tones, (n_frames, n_tones) each.
+        bright: bool (n_frames,), whether a tweezer is deep. Atoms do not feel a phase jump in the dark.
     """
     jumps: list[tuple[Any, ...]] = []
     for axis, tracks in enumerate(tracks_of_axes):

@@ -1,4 +1,4 @@
-"""Kernels that work out the mobile tweezers' light from a tone program.
+"""Kernels that compute the mobile tweezers' light from a tone program.
 
 An AOD deflects light by the sound that is inside the beam, so the light follows a tone only as a mean over
 the time that the sound takes to cross the beam. The weight of this mean is the beam's intensity,
@@ -23,7 +23,7 @@ from labseq_virtual.formulas import MIN_TONE_DEPTH
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Records = Any
-"""An array of records: numpy has no type for one that knows its columns."""
+"""An array of records. numpy has no type with the columns."""
 
 FRAMES_PER_TRANSIT: Final = 8
 HALF: Final = 6
@@ -31,22 +31,22 @@ HALF: Final = 6
 BEAM: Final = np.exp(-0.5 * (np.arange(-HALF, HALF + 1) * 4 / FRAMES_PER_TRANSIT) ** 2)
 WEIGHT: Final = BEAM / BEAM.sum()
 SAME: Final = 0.25
-"""Greatest distance, in sites, at which a tone continues one of the segment before (ours: about a waist)."""
+"""Greatest distance, in sites, at which a tone continues a tone of the last segment (ours, about a waist)."""
 MIXING: Final = 0.45
-"""Distance of two tones, in sites, below which their tweezers lose their atoms (ours): they beat so slowly
+"""Distance of two tones, in sites, below which their tweezers lose their atoms (ours). They beat so slowly
 that atoms heat."""
 EVEN: Final = 1e-6
 """Bend of a tone's course from frame to frame, in sites, that is neglected."""
 NEVER: Final = 1 << 30
-"""Stands for a frame that does not come."""
+"""Frame number of an event that does not happen."""
 ON: Final = 1e-6
 """Power relative to the intended one above which a tone is on (ours)."""
 PLACE, WAY, DEPTH, CHANGE = range(4)
-"""What is known of a track from a frame to the next: its place in sites, nan where it is off, and its
-displacement; the factor that it contributes to the depth of its tweezers, and its change."""
+"""Columns of a track from one frame to the next. Its position in sites (nan where it is off), the
+displacement, the factor that it contributes to the depth of its tweezers, and the factor's change."""
 CUT, MIXED = range(2)
-"""Faults of a track: the last frame before it ended although its tone was on, and the first in which it was
-too close to another one; ``NEVER`` without."""
+"""Faults of a track. The last frame before it ended although its tone was on, and the first in which it was
+too close to another track. ``NEVER`` without a fault."""
 MINIMUM_JERK, CONSTANT_JERK = int(FrequencyCourse.MINIMUM_JERK), int(FrequencyCourse.CONSTANT_JERK)
 
 
@@ -67,7 +67,7 @@ def find_batches(
     col_offsets: NDArray[np.int32],
     n_segments: int,
 ) -> Ints:
-    """The batches among the first segments: first segment, and that after the last (n_batches, 2).
+    """The batches among the first segments, as first segment and segment after the last (n_batches, 2).
 
     They are divided where no tweezer is on, at the end of a segment and at the start of the next.
     """
@@ -99,7 +99,7 @@ def fraction_done(course: int, u: float) -> float:
 
 @helper_kernel()
 def track_of(before: Records, tracks: Ints, faults: Ints, k: int, place: float) -> int:
-    """The track that a tone at a place continues in segment k: the nearest that no other continues; or -1."""
+    """The track that a tone at a place continues in segment k, the nearest that no other continues, or -1."""
     best, least = -1, SAME
     for j in range(len(before)):
         away = abs(before[j].end - place)
@@ -110,7 +110,7 @@ def track_of(before: Records, tracks: Ints, faults: Ints, k: int, place: float) 
 
 @helper_kernel()
 def find_mixed(tones: Records, tracks: Ints, k: int, faults: Ints) -> None:
-    """Mark the tracks that come too close in segment k; their distance changes from its start to its end."""
+    """Mark the tracks that come too close in segment k. Their distance changes from its start to its end."""
     for i in range(len(tones)):
         for j in range(i):
             before, after = tones[i].start - tones[j].start, tones[i].end - tones[j].end
@@ -125,8 +125,8 @@ def follow_tones(tones: Records, offsets: NDArray[np.int32], first: int, last: i
     """Follow the tones of the segments from ``first`` to before ``last``.
 
     Returns:
-        Track of each tone, counted from the first of the batch, -1 for tones that are off (n_tones,);
-        for each track the segment, counted likewise, before which it is cut, and that in which it is mixed
+        Track of each tone, counted from the first of the batch, or -1 for tones that are off (n_tones,),
+        and for each track the segments, counted likewise, before which it is cut and in which it is mixed
         (n_tracks, 2).
     """
     begin, n = offsets[first], 0
@@ -157,7 +157,7 @@ def played_tones(
     tones: Records, offsets: NDArray[np.int32], durations_s: Floats, courses: NDArray[np.int8],
     first: int, last: int, tracks: Ints, place: Floats, power: Floats, frame_s: float,
 ) -> None:  # fmt: skip
-    """Fill in places and powers as they are played (n_tracks, n_frames + 2 ``HALF``); 0 where off."""
+    """Fill in positions and powers as played (n_tracks, n_frames + 2 ``HALF``), 0 where off."""
     begin, start = offsets[first], 2.0 * HALF  # in frames
     for k in range(first, last):
         length = durations_s[k] / frame_s
@@ -175,20 +175,20 @@ def played_tones(
 
 @helper_kernel()
 def smooth(played: Floats, power: Floats, hz: float, place: Floats, depth: Floats) -> None:
-    """Let the sound of a track cross the beam.
+    """Compute the light of a track whose sound crosses the beam.
 
-    The place is the mean of the tone's frequency, weighted with its power. The light is the overlap of the
-    sound with a tone of the mean frequency and the mean chirp: where a chirp starts or stops, the phases
-    differ by some angle, and the light is fainter by ``exp(-variance)`` of that angle: its second cumulant,
-    as the frames are too few to add up the oscillations of a fast chirp.
+    The position is the mean of the tone's frequency, weighted with its power. The light is the overlap of the
+    sound with a tone of the mean frequency and the mean chirp. Where a chirp starts or stops, the phases
+    differ by some angle, so the light is fainter by ``exp(-variance)`` of it. This is the second cumulant,
+    because there are too few frames to add up the oscillations of a fast chirp.
 
     Args:
         played: Place as played, in sites, from ``HALF`` frames before to ``HALF`` frames after the others
             (n_frames + 2 ``HALF``,).
         power: Power as played, 0 where off, likewise.
         hz: Turns of the phase in a frame for a difference of one site.
-        place: The mean place (n_frames,); changed in place.
-        depth: The light; likewise.
+        place: The mean position (n_frames,). Changed in place.
+        depth: The light (n_frames,). Changed in place.
     """
     n, volts = len(place), np.sqrt(power)
     for k in range(n):
@@ -208,7 +208,7 @@ def smooth(played: Floats, power: Floats, hz: float, place: Floats, depth: Float
 
 @helper_kernel()
 def variance(played: Floats, power: Floats, hz: float, k: int, mean: float, chirp: float) -> float:
-    """Variance of the phase in the beam, beside that of a tone at ``mean`` with a ``chirp`` per frame."""
+    """Variance of the phase in the beam, relative to a tone at ``mean`` with a ``chirp`` per frame."""
     total = first = second = 0.0
     for direction in (-1, 1):
         angle, before = 0.0, played[k] - mean
@@ -233,11 +233,11 @@ def course_of(place: Floats, depth: Floats) -> Floats:
 
     Args:
         place: Place of each track in sites, nan where it is off (n_tracks, n_frames).
-        depth: Its factor of the depth, likewise.
+        depth: Depth factor of each track (n_tracks, n_frames).
 
     Returns:
-        The tracks (n_tracks, n_frames, 4). One that is off at the next frame, or was off at this one, has
-        depth 0 there, and does not move.
+        The tracks (n_tracks, n_frames, 4). A track that is off in one of two successive frames has depth 0 in
+        this frame, and does not move between the two.
     """
     n_frames = place.shape[1]
     course = np.zeros((len(place), n_frames, 4))
@@ -264,13 +264,13 @@ def light_of_axis(
     tones: Records, offsets: NDArray[np.int32], durations_s: Floats, courses: NDArray[np.int8],
     first: int, last: int, frame_s: float, step_hz: float,
 ) -> tuple[Floats, Ints]:  # fmt: skip
-    """The light of the tones of an axis in a batch: the segments from ``first`` to before ``last``.
+    """The light of the tones of an axis in a batch, for the segments from ``first`` to before ``last``.
 
     It begins ``HALF`` frames before the batch and ends as many after it.
 
     Args:
         tones: The tones of the axis (n_tones,), see :class:`labseq_virtual.records.Tone`.
-        offsets: Where the tones of each segment begin (n_segments + 1,).
+        offsets: Start of each segment in ``tones`` (n_segments + 1,).
         durations_s: Durations of the segments.
         courses: Courses of their frequencies.
         first: First segment.

@@ -1,4 +1,4 @@
-"""Which light is on at which time, as the lines switch it."""
+"""The light that the lines switch on at each time."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from labseq_virtual.settings import LightSettings
 
 
 class Lights:
-    """Which light is on, given the programs of the lines; without lines, all light is always on.
+    """The light that is on, from the programs of the lines. Without lines, all light is always on.
 
     Args:
         settings: The lines that each kind of light needs.
         specs: The lines of the profile.
-        of_qubit: The lines that the settings of the two levels name.
+        of_qubit: The lines named in the settings of the two levels.
 
     Raises:
-        ConfigError: The settings name a line that the profile does not have.
+        ConfigError: The settings name a line that is not in the profile.
     """
 
     def __init__(
@@ -31,14 +31,14 @@ class Lights:
         for key, needed in named.items():
             if names and (missing := [name for name in needed if name not in names]):
                 lines = ", ".join(f"'{name}'" for name in names)
-                raise ConfigError(f"`{key}` names a line '{missing[0]}'; the profile has {lines}")
+                raise ConfigError(f"`{key}` names a line '{missing[0]}', but the profile has {lines}")
         self._triggers = {spec.name: spec.triggers for spec in specs if spec.triggers}
         self._switches = [spec.name for spec in specs if spec.turns_off == "static_tweezers"]
         self._wires: dict[str, Callable[[float, float], object]] = {}
-        self._played: deque[tuple[float, LineProgram]] = deque(maxlen=8)  # an event needs the last one or two
+        self._played: deque[tuple[float, LineProgram]] = deque(maxlen=8)  # events need the last one or two
 
     def reset(self) -> None:
-        """Forget all programs: all light is on until the lines play again."""
+        """Forget all programs, so that all light is on until the lines play again."""
         self._played.clear()
         self._wires.clear()
 
@@ -59,12 +59,12 @@ class Lights:
                 self._wires[role](t_s, width_s)
 
     def tweezers_off(self, program: LineProgram) -> tuple[list[tuple[float, float]], bool]:
-        """When a program turns the static tweezers off, in seconds from its start; whether they stay off."""
+        """Times when a program turns the static tweezers off, in seconds, and whether they stay off."""
         stay_off = any(program.on[-1, program.lines.index(name)] for name in self._switches)
         return [span for name in self._switches for span in program.spans(name)], stay_off
 
     def fraction_on(self, kind: str, start_s: float, end_s: float) -> float:
-        """Fraction of an interval during which a kind of light is on, that is, all its lines are."""
+        """Fraction of an interval during which a kind of light is on, because all its lines are on."""
         needed = self._needs[kind]
         if not self._played or not needed:
             return 1.0

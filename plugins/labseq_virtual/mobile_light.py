@@ -24,7 +24,7 @@ SLEW_HZ: Final = 0.2e6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MobileTones:
-    """The tones that are on: positions in sites, and powers relative to the intended ones.
+    """The tones that are on, with positions in sites and powers relative to the intended powers.
 
     Attributes:
         row: float64 (n_row_tones,), positions of the row tones.
@@ -42,7 +42,7 @@ class MobileTones:
 def with_true_response(
     grid: SiteGrid, motion: MotionSpec, light: MobileLightSettings, seed: int
 ) -> MotionSpec:
-    """The motion with the amplitudes that really give the full depth: each tone has its own response."""
+    """The motion with the amplitudes that really give the full depth, as each tone has its own response."""
     if light.tone_response == 0:
         return motion
     random = RandomStream(seed, "simulation.mobile_light").machine()
@@ -55,13 +55,13 @@ def with_true_response(
 
 
 class MobileLight:
-    """Finds the places and powers of the mobile tweezers from a program, or from what the outputs played.
+    """Finds the positions and powers of the mobile tweezers from a program, or from the played outputs.
 
     Args:
         grid: The grid of sites.
-        motion: How the tweezers move, with the amplitudes that give the full depth.
+        motion: Motion of the tweezers, with the amplitudes that give the full depth.
         light: Settings of the light.
-        positions: Where each tone puts its light.
+        positions: Positions of the light of each tone.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class MobileLight:
         self._full_v = full_volts(grid, motion)
 
     def of_program(self, program: ToneProgram, t_s: float) -> MobileTones | None:
-        """The tones of a program at a time from its start; None if none is on."""
+        """The tones of a program at a time from its start. None if none is on."""
         now = program.tones_at(t_s)
         return self._tones(
             [(tones.frequency_hz, tones.amplitude) for tones in (now.row, now.column)], self._full
@@ -81,11 +81,11 @@ class MobileLight:
     def of_outputs(
         self, rows: Sequence[RfSpan], columns: Sequence[RfSpan], now_s: float
     ) -> MobileTones | None:
-        """The tones that the outputs have played just before a time; None if there are none."""
+        """The tones that the outputs have played just before a time. None if there are none."""
         tones: list[tuple[Floats, Floats]] = []
         transit_s = self._light.transit_time
         for spans, band, full_v in zip((rows, columns), bands(self._grid), self._full_v, strict=True):
-            # six transit times of the sound; tones weaker than 5 % of the full depth's are left out (ours)
+            # six transit times of the sound, without tones weaker than 5 % of the full depth's (ours)
             start_s, min_v = now_s - 6.0 * transit_s, 0.05 * float(full_v.min())
             tracks = track_tones(spans, start_s, now_s, band, transit_s, min_v, SLEW_HZ)
             frame = len(tracks.t_s) // 2
@@ -94,7 +94,7 @@ class MobileLight:
         return self._tones(tones, self._full_v)
 
     def positions_m(self, tones: MobileTones) -> Floats:
-        """Where the tweezers are, float64 (n_row_tones, n_column_tones, 2), (x, y) from the grid's centre."""
+        """Tweezer positions, float64 (n_row_tones, n_column_tones, 2), (x, y) from the grid's centre."""
         a1, a2 = self._grid.axes
         row, column = tones.row[:, None, None], tones.column[None, :, None]
         return self._grid.positions_m[0, 0] + row * a2 + column * a1

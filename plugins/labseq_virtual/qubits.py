@@ -1,6 +1,6 @@
 """The two levels of each atom, driven by pulses, and the light that removes atoms in the upper one.
 
-Optical Bloch equations in the frame of the drive, with (u, v, w) of each site; w is -1 in the lower level and
+Optical Bloch equations in the frame of the drive, with (u, v, w) of each site. w is -1 in the lower level and
 1 in the upper one::
 
     du/dt = -u / T2 - D v + R sin(p) w
@@ -37,7 +37,7 @@ class Qubits:
 
     Args:
         shape: (n_rows, n_cols).
-        t_s: When they were prepared, on the session's clock.
+        t_s: Time when the atoms were prepared, on the session's clock.
         rng: Random numbers of the shot.
 
     Attributes:
@@ -63,12 +63,12 @@ class Qubits:
         """Apply a program of the lines.
 
         Args:
-            t_start_s: Its start on the session's clock.
+            t_start_s: Start of the program on the session's clock.
             source: "frequency" in Hz, "phase" and "shift" in rad of the drive.
-            atoms: The atoms; changed in place.
+            atoms: The atoms. Changed in place.
 
         Returns:
-            Number of atoms that push-out light has removed.
+            Number of atoms that the push-out light has removed.
         """
         settings, n_lost = self._settings, 0
         detuning_hz = source["frequency"] - settings.transition - self._offsets_hz
@@ -86,7 +86,7 @@ class Qubits:
         return n_lost
 
     def _rates(self, detuning_hz: Floats, phase: float | None) -> Floats:
-        """The matrix of the equations (..., 3, 3), in 1/s; without drive if it has no phase."""
+        """The matrix of the equations (..., 3, 3), in 1/s. Without a phase there is no drive."""
         rabi = 0.0 if phase is None else 2 * math.pi * self._settings.rabi_frequency
         x, y = (rabi * part(phase or 0.0) for part in (math.cos, math.sin))
         rates = np.zeros((*detuning_hz.shape, 3, 3))
@@ -97,12 +97,12 @@ class Qubits:
         return rates - np.diag([1 / t2_s, 1 / t2_s, 1 / t1_s])
 
     def _push_out(self, duration_s: float, atoms: Atoms) -> int:
-        """Remove atoms, most of them in the upper level; those that stay are in no superposition."""
+        """Remove atoms, mostly from the upper level. The remaining atoms are not in a superposition."""
         times_s = np.array([self._settings.push_out_time, self._settings.push_out_time_other])
         stay = np.exp(-duration_s / times_s)
         upper, lower = self.upper * stay[0], (1 - self.upper) * stay[1]
         self._bloch[..., :2] = 0.0
-        self._bloch[..., 2] = (upper - lower) / np.maximum(upper + lower, 1e-300)  # of nothing: 0
+        self._bloch[..., 2] = (upper - lower) / np.maximum(upper + lower, 1e-300)  # 0 without atoms
         return atoms.lose(self._rng.random(atoms.occupied.shape) >= upper + lower)
 
 
@@ -114,7 +114,7 @@ def _between_edges(program: LineProgram) -> Iterator[tuple[float, frozenset[str]
 
 
 def exponential(matrices: Floats) -> Floats:
-    """Exponentials of matrices (..., n, n), by a Taylor series of a part that is squared until it is whole.
+    """Exponentials of matrices (..., n, n), by a Taylor series of a fraction that is then squared repeatedly.
 
     Example:
         >>> quarter = exponential(np.array([[0.0, -1.0], [1.0, 0.0]]) * np.pi / 2)

@@ -1,7 +1,7 @@
-"""Records: what the kernels of the transport know of a tone, of a site, and of an atom.
+"""Records of a tone, a site and an atom, for the kernels of the transport.
 
-A class lists the columns of an array, and :func:`record` makes the array's dtype of it. ``site.depth`` then
-reads a column, in compiled code too. To add a column, add a line to its class.
+A class lists the columns of an array, and :func:`record` makes the array's dtype from it. ``site.depth`` then
+reads a column, also in compiled code. To add a column, add a line to its class.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 Dtype = np.dtype[Any]
 
 FATES: Final = ("kept", "hand_over", "transport", "collision", "ejected", "program")
-"""What may become of an atom that a mobile tweezer held: kept, or lost by one of these causes."""
+"""Fates of an atom that a mobile tweezer held. It is kept, or lost by one of these causes."""
 
 NUMBERS: Final[dict[Any, Any]] = {float: np.float64, int: np.int64, bool: np.bool_}
 
@@ -26,7 +26,7 @@ def record(columns: type) -> Dtype:
 
 
 def signature(dtype: Dtype) -> str:
-    """The type of a record as numba writes it, for the signature of a kernel that Python calls."""
+    """The type of a record in numba's notation, for the signature of a kernel that Python calls."""
     columns: list[str] = []
     for name, (kind, offset, *_) in (dtype.fields or {}).items():
         number = "boolean" if kind == np.bool_ else kind.name
@@ -38,10 +38,10 @@ class Tone:
     """A tone in a segment.
 
     Attributes:
-        start: Its position at the start, in sites.
-        end: At the end.
-        power_start: Its power at the start, relative to the intended one.
-        power_end: At the end.
+        start: Initial position, in sites.
+        end: Final position, in sites.
+        power_start: Initial power, relative to the intended power.
+        power_end: Final power, relative to the intended power.
     """
 
     start: float
@@ -54,10 +54,10 @@ class Site:
     """A site and its atom.
 
     Attributes:
-        atom: Whether there is one.
+        atom: Whether the site holds an atom.
         depth: Depth of the static tweezer per mass, in m^2/s^2.
-        heat: Temperature of the atom, as it would be at the nominal depth.
-        since_s: The time that the temperature belongs to.
+        heat: Temperature of the atom, converted to the nominal depth.
+        since_s: Time at which the temperature was valid.
     """
 
     atom: bool
@@ -83,16 +83,16 @@ ATOM: Final = record(Atom)
 
 
 class Plane(NamedTuple):
-    """The plane of the sites. Numbers, as compiled code counts the references to an array that it passes on.
+    """The plane of the sites, as numbers, because compiled code counts references to arrays.
 
     Attributes:
-        x: Position of site (0, 0), in metres.
-        y: Likewise.
-        x_row: Step from row to row, in metres.
-        y_row: Likewise.
-        x_col: Step from column to column.
-        y_col: Likewise.
-        row_x: Rows per metre along x; with the next three the inverse of the steps.
+        x: x of site (0, 0), in metres.
+        y: y of site (0, 0).
+        x_row: x step from row to row, in metres.
+        y_row: y step from row to row.
+        x_col: x step from column to column.
+        y_col: y step from column to column.
+        row_x: Rows per metre along x. With the next three the inverse of the steps.
         row_y: Rows per metre along y.
         col_x: Columns per metre along x.
         col_y: Columns per metre along y.
@@ -111,7 +111,7 @@ class Plane(NamedTuple):
 
 
 def plane_of(corner_m: ArrayLike, down_m: ArrayLike, right_m: ArrayLike) -> tuple[float, ...]:
-    """The numbers of :class:`Plane`, from where the first site is and the steps between sites.
+    """The numbers of :class:`Plane`, from the first site's position and the steps between sites.
 
     Args:
         corner_m: Place of site (0, 0), (2,).

@@ -1,8 +1,8 @@
-"""Finding the tones in what RF outputs have played.
+"""Finds the tones in the signal that RF outputs have played.
 
 The light that an AOD sends to a point in the focal plane is the Fourier component of the acoustic wave
-inside the beam: the spectrum of the last microseconds, in a window with the beam's profile. The spectra
-here are therefore both a measurement and the response of the AOD: a jump of amplitude, phase or frequency
+inside the beam, the spectrum of the last microseconds in a window with the beam's profile. The spectra
+here are therefore both a measurement and the response of the AOD. A jump of amplitude, phase or frequency
 is smoothed over the time that the sound takes to cross the beam.
 """
 
@@ -25,7 +25,7 @@ BLOCK: Final = 1024
 BAND_HZ: Final = 50e6
 """Smallest width of the AODs' band (ours)."""
 BESIDE: Final = 0.25
-"""How far beyond the outermost site or ejection slot a resting tone is dark, in tone spacings (ours)."""
+"""Distance beyond the last site or ejection slot at which a resting tone is dark, in tone spacings (ours)."""
 EVERYWHERE: Final = (-math.inf, math.inf)
 
 
@@ -34,8 +34,8 @@ class Band:
     """The frequencies that an AOD deflects.
 
     Attributes:
-        low_hz: The lowest one.
-        width_hz: Distance to the highest. It sets the sample rate of the envelope, so bands of the same
+        low_hz: The lowest frequency.
+        width_hz: Width of the band. It sets the sample rate of the envelope, so bands of the same
             width are sampled at the same times.
     """
 
@@ -61,21 +61,21 @@ class Envelope:
 
 
 def bands(grid: SiteGrid) -> list[Band]:
-    """The bands of the AODs of rows and columns: of one width, so that their frames have common times."""
+    """The bands of the AODs of rows and columns, of the same width so that their frames coincide."""
     axes = (grid.row_frequency_hz, grid.column_frequency_hz)
     width_hz = max(BAND_HZ, *(1.4 * float(np.ptp(hz)) for hz in axes))
     return [Band(max(0.0, float(hz.max() + hz.min() - width_hz) / 2), width_hz) for hz in axes]
 
 
 def reach_hz(sites_hz: NDArray[np.float64], eject_slots: int) -> tuple[float, float]:
-    """The tones that send light to a site or an ejection slot; a tone that rests outside of them does not."""
+    """The range of tones that send light to a site or an ejection slot. A tone at rest outside does not."""
     step_hz = float(np.abs(np.diff(sites_hz)).max(initial=0.0))
     margin_hz = (eject_slots + BESIDE) * step_hz
     return float(sites_hz.min()) - margin_hz, float(sites_hz.max()) + margin_hz
 
 
 def active_spans(span: RfSpan, reach_hz: tuple[float, float] = EVERYWHERE) -> list[tuple[float, float]]:
-    """Times when a span sends light to the atoms: (start, end) in seconds, in order."""
+    """Times when a span sends light to the atoms, as (start, end) in seconds, in order."""
     if isinstance(span, RfTones):
         low, high = reach_hz
         near = (span.frequency_hz > low) & (span.frequency_hz < high)
@@ -94,7 +94,7 @@ def active_spans(span: RfSpan, reach_hz: tuple[float, float] = EVERYWHERE) -> li
 def envelope(spans: Sequence[RfSpan], start_s: float, end_s: float, band: Band) -> Envelope:
     """The part of an output within a band, between two times.
 
-    Samples are filtered by one Fourier transform of the whole interval; tones are
+    Samples are filtered by one Fourier transform of the whole interval, and tones are
     added up directly. The band's edges are soft.
     """
     sampled = [span for span in spans if isinstance(span, RfSamples)]
@@ -153,7 +153,7 @@ def _of_tones(spans: Sequence[RfTones], start_s: float, end_s: float, band: Band
 
 
 def _response(n: int) -> NDArray[np.float64]:
-    """Diffraction efficiency over the band: it falls to 0 over 5 % of the band at each end (ours)."""
+    """Diffraction efficiency over the band. It falls to 0 over 5 % of the band at each end (ours)."""
     from_edge = np.minimum(np.arange(n) + 0.5, n - np.arange(n) - 0.5) / n
     return np.sin(np.pi / 2 * np.minimum(1.0, from_edge / 0.05)) ** 2
 
@@ -161,7 +161,7 @@ def _response(n: int) -> NDArray[np.float64]:
 Floats = NDArray[np.float64]
 
 WINDOW: Final = 2.5
-"""Length of a window in transit times: at its ends a Gaussian beam is down to e^-12.5."""
+"""Length of a window in transit times, at whose ends a Gaussian beam is down to e^-12.5."""
 HOPS: Final = 8
 """Windows per transit time."""
 REACH_HZ: Final = 800e3
@@ -169,26 +169,26 @@ REACH_HZ: Final = 800e3
 APART_HZ: Final = 450e3
 """Smallest distance of two tones that can be resolved (ours)."""
 FRAMES: Final = 8192
-"""Spectra computed at once: 80 MB at a transit time of 10 us, for programs of any length."""
+"""Number of spectra computed at once. 80 MB at a transit time of 10 us, for programs of any length."""
 
 
 MIN_TURNS: Final = 2.0
-"""Smallest number of beats of two tones within a transit time: with fewer, their peaks merge."""
+"""Smallest number of beats of two tones within a transit time. With fewer, their peaks merge."""
 MAX_SITES: Final = 0.6
-"""Largest motion of a tweezer in a transit time: a faster chirp is as broad as the gap to the next tone."""
+"""Largest motion of a tweezer in a transit time. A faster chirp is as broad as the gap to the next tone."""
 PEAK_SPEED: Final = {"constant": 1.0, "minimum_jerk": 15 / 8, "constant_jerk": 3 / 2}
 """Greatest speed over the mean, see :class:`labseq.plugin.motion.FrequencyCourse`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """Tones over time, nan where one is off; a column may hold several, one after the other.
+    """Tones over time, nan where a tone is off. A column may hold several tones, one after the other.
 
     Attributes:
         t_s: float64 (n_frames,), times, equally spaced.
         frequency_hz: float64 (n_frames, n_tracks).
         amplitude_v: float64 (n_frames, n_tracks), peak volts.
-        phase_rad: float64 (n_frames, n_tracks), of cos(phase) at that time.
+        phase_rad: float64 (n_frames, n_tracks), phase of the cosine at that time.
     """
 
     t_s: Floats
@@ -203,7 +203,7 @@ def sites_in_transit(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> fl
 
 
 def check_resolvable(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> None:
-    """Check that :func:`track_tones` can resolve the tones; otherwise atoms would be lost in the analysis.
+    """Check that :func:`track_tones` can resolve the tones. Otherwise the analysis would lose atoms.
 
     Raises:
         LimitError: The tones of two neighbours are too close, or move too fast.
@@ -215,11 +215,11 @@ def check_resolvable(grid: SiteGrid, motion: MotionSpec, transit_s: float) -> No
     if step_hz < (min_hz := max(APART_HZ, MIN_TURNS / transit_s)):
         step, least = (format_quantity(hz, "frequency") for hz in (step_hz, min_hz))
         quantity = f"the smallest step of the sites' tones at a transit_time of {transit}"
-        raise LimitError(quantity, step, f"at least {least}: tones closer than that cannot be resolved", hint)
+        raise LimitError(quantity, step, f"at least {least} (closer tones cannot be resolved)", hint)
     if (sites := sites_in_transit(grid, motion, transit_s)) > MAX_SITES:
         quantity = f"the motion of a mobile tweezer in a transit_time of {transit}"
         raise LimitError(
-            quantity, f"{sites:.2g} sites", f"{MAX_SITES:g}: a faster chirp blurs the tones", hint
+            quantity, f"{sites:.2g} sites", f"{MAX_SITES:g} (a faster chirp blurs the tones)", hint
         )
 
 
@@ -232,16 +232,16 @@ def track_tones(
     min_v: float,
     slew_hz: float,
 ) -> Tracks:
-    """Recover the tones from what an output played, without knowing the program.
+    """Recover the tones from an output's signal, without knowing the program.
 
     Frequency, amplitude and phase are means over the beam, weighted with its intensity
-    ``exp(-2 (2 t / transit)^2)``. The amplitude is coherent, the overlap with the beam of a tone
-    that does not jump: one that jumps by pi in the middle of the beam has none for a moment.
+    ``exp(-2 (2 t / transit)^2)``. The amplitude is coherent, the overlap with a tone without jumps
+    in the beam. A tone that jumps by pi in the middle of the beam has none for a moment.
 
     Args:
-        spans: What the output played, in order of time.
+        spans: Signal of the output, in order of time.
         start_s: Start of the interval.
-        end_s: Its end.
+        end_s: End of the interval.
         band: The AOD's band.
         transit_s: Time that the sound takes across the beam, 1/e^2 of the intensity at both ends.
         min_v: Smallest amplitude of a tone, in volts.
@@ -286,7 +286,7 @@ class _Spectra:
         self._last: tuple[int, NDArray[np.complex64]] | None = None
 
     def spectra(self, first: int) -> NDArray[np.complex64]:
-        """Spectra of the frames from ``first`` on, phases as of the middle of each; cached."""
+        """Spectra of the frames from ``first`` on, with phases in the middle of each frame. Cached."""
         from scipy import fft
 
         if self._last is None or self._last[0] != first:
@@ -298,16 +298,16 @@ class _Spectra:
 
 
 def _powers(spectra: NDArray[np.complex64]) -> Iterator[NDArray[np.float32]]:
-    """The squared magnitudes, some frames at a time: those of all would take as much memory again."""
+    """The squared magnitudes, some frames at a time, because all together would double the memory."""
     for first in range(0, len(spectra), 256):
         part = spectra[first : first + 256]
         yield part.real**2 + part.imag**2
 
 
 def forget_transforms() -> None:
-    """Free the tables that SciPy keeps of the latest 16 lengths: 20 MB for each program, as none recurs.
+    """Free the tables that SciPy keeps for the latest 16 lengths, 20 MB per program, as no length recurs.
 
-    It has no call for that, so 16 short transforms of each kind take their places.
+    SciPy has no call for that, so 16 short transforms of each kind replace them.
     """
     from scipy import fft
 
@@ -325,11 +325,11 @@ class RfPulse:
     """An interval during which the light is on, from silence to silence.
 
     Attributes:
-        start_s: When the first output begins to play.
-        end_s: When the last one has ended.
-        rows: What the row output played, in order of time.
-        columns: What the column output played.
-        continued: Whether it continues a pulse that was cut off at the end of the previous call.
+        start_s: Time when the first output begins to play.
+        end_s: Time when the last output has ended.
+        rows: Signal of the row output, in order of time.
+        columns: Signal of the column output, in order of time.
+        continued: Whether the pulse continues a pulse that was cut off at the end of the previous call.
     """
 
     start_s: float
@@ -340,12 +340,12 @@ class RfPulse:
 
 
 class PulseReceiver:
-    """Splits what a driver's outputs play into pulses, at the silences.
+    """Splits the signals of a driver's outputs into pulses, at the silences.
 
     Args:
         source: The outputs.
         silence_s: Shortest silence that ends a pulse.
-        reach_hz: For each axis the tones that send light to the atoms; others that rest count as silence.
+        reach_hz: For each axis the tones that send light to the atoms. Other tones at rest count as silence.
     """
 
     def __init__(
@@ -361,9 +361,9 @@ class PulseReceiver:
         self._seen: tuple[list[RfSpan], list[RfSpan]] = [], []
 
     def look(self, until_s: float) -> tuple[Sequence[RfSpan], Sequence[RfSpan], bool]:
-        """What rows and columns played since the last pulse was received, and whether light is on at a time.
+        """Signals of rows and columns since the last received pulse, and whether light is on at a time.
 
-        The next call of ``receive_until`` returns it, too.
+        The next call of ``receive_until`` returns the same signals.
         """
         for seen, spans in zip(self._seen, self._source.played(until_s), strict=True):
             seen += spans
@@ -376,7 +376,7 @@ class PulseReceiver:
         return *self._seen, is_on
 
     def receive_until(self, until_s: float) -> Iterator[RfPulse]:
-        """The pulses played until a time; the last one is cut off there if it has not ended."""
+        """The pulses played until a time. The last one is cut off there if it has not ended."""
         self.look(until_s)
         played, self._seen = self._seen, ([], [])
         cut_s, self._cut_s = self._cut_s, until_s

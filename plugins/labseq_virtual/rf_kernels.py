@@ -22,7 +22,7 @@ YOUNG = 8
 
 @helper_kernel()
 def find_peaks(power: NDArray[np.float32], k: int, threshold: float, reach: int, found: Ints) -> int:
-    """Find the peaks of spectrum k, each the greatest within ``reach`` bins, rising; returns how many."""
+    """Find the peaks of spectrum k, each the greatest within ``reach`` bins, rising. Returns their number."""
     n = 0
     for b in range(1, power.shape[1] - 1):
         here = power[k, b]
@@ -41,7 +41,7 @@ def find_peaks(power: NDArray[np.float32], k: int, threshold: float, reach: int,
 def find_tones(
     power: NDArray[np.float32], threshold: float, apart: int, reach: int, max_tones: int
 ) -> tuple[Floats, Ints]:
-    """Find the tones in each spectrum: the centroids of the power around its peaks.
+    """Find the tones in each spectrum as centroids of the power around its peaks.
 
     The centroid of a chirp is its mean frequency in the window. A tone includes the bins within
     ``reach`` of its peak, up to the middle between it and the next peak.
@@ -51,10 +51,10 @@ def find_tones(
         threshold: Smallest power of a peak.
         apart: Smallest distance of two peaks, in bins.
         reach: Half the width of the part of a spectrum that belongs to a tone, in bins.
-        max_tones: Maximum number of tones in a spectrum; further ones are ignored.
+        max_tones: Maximum number of tones in a spectrum. Further tones are ignored.
 
     Returns:
-        The tones in bins (n_frames, max_tones), rising, and how many there are (n_frames,).
+        The tones in bins (n_frames, max_tones), rising, and their numbers (n_frames,).
     """
     n_frames, n_bins = power.shape
     centroid = np.full((n_frames, max_tones), np.nan)
@@ -80,15 +80,15 @@ def find_tones(
 def link_tones(centroid: Floats, count: Ints, slew: float) -> tuple[Floats, int]:
     """Follow tones from frame to frame by linear extrapolation of their last two frequencies.
 
-    A tone that jumps may look like two for a moment: the older track continues.
+    A tone that jumps may look like two tones for a moment. Then the older track continues.
 
     Args:
         centroid: Tones of each frame, rising, in bins (n_frames, most).
-        count: How many there are in each frame.
+        count: Number of tones in each frame.
         slew: Largest distance of a tone from its extrapolated frequency, in bins.
 
     Returns:
-        Tracks in bins (n_frames, n_columns), nan where off, and how many columns are used. A
+        Tracks in bins (n_frames, n_columns), nan where off, and the number of used columns. A
         column may hold several tones one after the other, with a frame of nan between them.
     """
     n_frames, most = centroid.shape
@@ -123,24 +123,24 @@ def link_tones(centroid: Floats, count: Ints, slew: float) -> tuple[Floats, int]
 def measure_tones(
     spectra: NDArray[np.complex64], tracks: Floats, first: int, reach: int, width: float, hop: float
 ) -> tuple[Floats, Floats]:
-    """Amplitude and phase of followed tones: their overlap with a tone that chirps as they do.
+    """Amplitude and phase of followed tones, from their overlap with a tone of the same chirp.
 
     A tone of amplitude 1 and phase 0 in the middle of the window ``exp(-(n / tau)^2)``, with a
     chirp of c bins per frame, has the spectrum ``sqrt(pi / p) exp(-pi^2 f^2 / p)`` with
-    ``p = 1 / tau^2 - i pi c``. The overlap of the measured spectrum with this one is the mean of the
+    ``p = 1 / tau^2 - i pi c``. The overlap of the measured spectrum with this spectrum is the mean of the
     amplitude in the squared window. A tone ends in the middle between it and the next.
 
     Args:
-        spectra: (n_frames, n_bins), phases as of the middle of the frames.
+        spectra: (n_frames, n_bins), with phases in the middle of the frames.
         tracks: (at least first + n_frames, n_tracks), in bins.
-        first: Frame of the tracks that the first spectrum belongs to.
+        first: Frame of the tracks for the first spectrum.
         reach: Half the width of a tone's part of a spectrum, in bins.
-        width: The window's tau times the width of a bin: a number without a unit.
+        width: The window's tau times the width of a bin, dimensionless.
         hop: From frame to frame, in units of one over the width of a bin.
 
     Returns:
         Amplitude and phase (rad) of each tone, (n_frames, n_tracks), nan where off. The
-        amplitude is that of a window of sum 1.
+        amplitude is for a window of sum 1.
     """
     n_frames, n_bins = spectra.shape
     n_tracks = tracks.shape[1]

@@ -1,4 +1,4 @@
-"""EMCCD and qCMOS sensors: from photoelectrons to counts."""
+"""EMCCD and qCMOS sensors, which convert photoelectrons to counts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NEVER: Final = 1e-13
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CountDistribution:
-    """A distribution of integers: its cumulative probability in a table, inverted with 32 random bits.
+    """A distribution of integers, as a table of its cumulative probability, inverted with 32 random bits.
 
     Probabilities are rounded to whole multiples of 2^-32.
 
@@ -37,7 +37,7 @@ class CountDistribution:
 
     @classmethod
     def of(cls, probability: NDArray[np.float64], first: int = 0) -> CountDistribution:
-        """Tabulate the probabilities (n,) of ``first``, ``first`` + 1, ...; they need not add up to 1."""
+        """Tabulate the probabilities (n,) of ``first``, ``first`` + 1, ..., which need not add up to 1."""
         from labseq_virtual import image_kernels as kernels
 
         below = np.cumsum(np.maximum(probability, 0.0))
@@ -65,14 +65,14 @@ class CountDistribution:
 
 
 def _words(n: int, rng: np.random.Generator) -> NDArray[np.uint32]:
-    """Random words of 32 bits; two are drawn at once, which is twice as fast."""
+    """Random words of 32 bits. Two are drawn at once, which is twice as fast."""
     return rng.integers(0, 2**64 - 1, (n + 1) // 2, np.uint64, endpoint=True).view(np.uint32)[:n]
 
 
 Complex = NDArray[np.complex128]
 
 N_ONE_BY_ONE: Final = 32
-"""Up to this number of electrons into the register, the output of each is drawn separately."""
+"""Up to this number of input electrons, the output of each is drawn separately."""
 
 
 @dataclass(frozen=True)
@@ -80,13 +80,13 @@ class Register:
     """A register of equal stages.
 
     In a stage, each electron frees another with the probability p, where (1 + p)^n_stages is
-    the gain. With the generating function of a stage, f(s) = (1 - p) s + p s^2, that of the
-    whole register is f applied n_stages times; its Fourier transform gives the exact distribution of
+    the gain. With the generating function of a stage, f(s) = (1 - p) s + p s^2, the function of the
+    whole register is f applied n_stages times. Its Fourier transform gives the exact distribution of
     the output.
 
     Attributes:
         n_stages: Number of stages.
-        gain: Mean electrons out for one in; 1 is a plain CCD.
+        gain: Mean electrons out for one in. 1 is a plain CCD.
     """
 
     n_stages: int
@@ -99,7 +99,7 @@ class Register:
 
     @property
     def excess_noise(self) -> float:
-        """F^2: variance of the output over gain^2 times that of a Poisson input.
+        """F^2, the variance of the output over gain^2 times the variance of a Poisson input.
 
         M. Robbins, B. Hadwen, IEEE Trans. Electron Devices 50, 1227 (2003).
 
@@ -120,7 +120,7 @@ class Register:
 
         Args:
             mean_electrons: Mean number of electrons in.
-            n_values: A power of two; larger outputs must be practically impossible.
+            n_values: A power of two. Larger outputs must be practically impossible.
 
         Returns:
             float64 (n_values,), probability of 0, 1, ... electrons out.
@@ -164,17 +164,17 @@ def _transform(n_stages: int, gain: float, n_values: int) -> Complex:
 
 
 class View(ImageSettings):
-    """Image settings of one sensor mode: the part that is read, its binning, gain and stray light."""
+    """Image settings of one sensor mode, with the part that is read, its binning, gain and stray light."""
 
     region: tuple[int, int, int, int] = Field(description="[y, x, height, width] of the part that is read")
     binning: int = Field(
-        description="pixels of the sensor per pixel of a frame along each axis: added up before the register "
+        description="pixels of the sensor per pixel of a frame along each axis, added up before the register "
         "of an EMCCD, and after the read-out of a qCMOS camera"
     )
 
     @classmethod
     def of(cls, settings: ImageSettings, mode: SensorMode = WHOLE_SENSOR) -> Self:
-        """The settings in a mode; a closed shutter keeps stray light out too.
+        """The settings in a mode. A closed shutter also keeps stray light out.
 
         Raises:
             LimitError: The sensor has no such part, binning or EM register.
@@ -190,9 +190,9 @@ class View(ImageSettings):
 
     @property
     def readout_fraction(self) -> float:
-        """Time to read a frame, relative to that of the whole sensor without binning.
+        """Time to read a frame, relative to the whole sensor without binning.
 
-        An EMCCD reads its pixels one after the other, a qCMOS camera its rows.
+        An EMCCD reads pixel by pixel, a qCMOS camera row by row.
         """
         height, width = self.frame
         rows, cols = self.region[2:]
@@ -209,11 +209,11 @@ def _check(settings: ImageSettings, mode: SensorMode, region: tuple[int, int, in
         raise LimitError("the region of the sensor", text, f"its {rows} x {cols} pixels")
     if mode.binning < 1 or height % mode.binning or width % mode.binning:
         raise LimitError(
-            "the binning", mode.binning, f"what divides the {height} x {width} pixels of the region"
+            "the binning", mode.binning, f"a divisor of the {height} x {width} pixels of the region"
         )
     if settings.sensor == "qcmos" and mode.em_gain not in (None, 1.0):
         hint = "leave the camera's `em_gain` out, or set the simulation's `image.sensor: emccd`"
-        raise LimitError("the EM gain", f"{mode.em_gain:g}", "1: a qCMOS sensor has no EM register", hint)
+        raise LimitError("the EM gain", f"{mode.em_gain:g}", "1 (a qCMOS sensor has no EM register)", hint)
 
 
 FULL_SCALE: Final = 65535
@@ -223,7 +223,7 @@ MAX_WORK: Final = 2**23
 """Size of a table (outputs of the register times counts within the read noise) above which none is made."""
 
 MAX_ELECTRONS: Final = 300
-"""Mean electrons of a dark pixel above which no table is made; fewer never fill a well."""
+"""Mean electrons of a dark pixel above which no table is made. Fewer never fill a well."""
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ class Output:
     """The output stage behind the register.
 
     Attributes:
-        well: Electrons that the register holds.
+        well: Maximum number of electrons in the register.
         read_noise: Electrons r.m.s.
         electrons_per_adu: Electrons per count.
         offset: Counts of a dark pixel.
@@ -249,20 +249,20 @@ class Output:
 
 
 STAGES: Final = 536
-"""Stages of the EM register (ours: as many as in Hirsch et al., PLoS ONE 8, e53671, 2013)."""
+"""Stages of the EM register (ours, as in Hirsch et al., PLoS ONE 8, e53671, 2013)."""
 
 
 class Emccd:
     """An EMCCD camera.
 
     The electrons of a pixel (photoelectrons, and the clock-induced charge of the sensor) pass the EM
-    register; then follow read noise, offset and an analogue-to-digital converter of 16 bit. Pixels
-    without an atom's light share one distribution, which is computed once for an exposure time and
-    drawn from a table; for the others each step is drawn.
+    register. Then follow read noise, offset and an analogue-to-digital converter of 16 bit. Pixels
+    without an atom's light share one distribution, which is computed once per exposure time and
+    drawn from a table. For the other pixels each step is drawn.
     """
 
     quantum_efficiency: Final = 1.0
-    """Relative to itself: the settings give the photoelectrons of this camera."""
+    """1, because the settings give the photoelectrons of this camera."""
 
     def __init__(self, settings: View) -> None:
         self.binning = settings.binning
@@ -305,7 +305,7 @@ class Emccd:
 
 @lru_cache(maxsize=64)
 def _dark_counts(register: Register, output: Output, mean_electrons: float) -> CountDistribution | None:
-    """Distribution of the counts of a pixel without an atom's light; None if the table would be too long."""
+    """Distribution of the counts of a pixel without an atom's light. None if the table would be too long."""
     n_values = power_of_two((mean_electrons + 9 * (2 * mean_electrons) ** 0.5 + 45) * register.gain)
     spread = output.read_noise / output.electrons_per_adu
     reach = int(np.ceil(6.5 * spread)) + 1
@@ -316,7 +316,7 @@ def _dark_counts(register: Register, output: Output, mean_electrons: float) -> C
     value = np.minimum(np.arange(len(p)), output.well) / output.electrons_per_adu + output.offset
     nearest = np.rint(value).astype(np.int64)
     probability = np.zeros(FULL_SCALE + 1)
-    n_counts = min(FULL_SCALE, int(nearest[-1]) + reach) + 1  # those above are impossible
+    n_counts = min(FULL_SCALE, int(nearest[-1]) + reach) + 1  # larger counts are impossible
     below = normal_below(nearest - reach - value - 0.5, spread)
     for distance in range(-reach, reach + 1):
         count = nearest + distance
@@ -334,7 +334,7 @@ def normal_below(distance: NDArray[np.float64], spread: float) -> NDArray[np.flo
 
 @cache
 def _normal() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points and values of the normal distribution function; linear between them, it is right to 1e-7.
+    """Points and values of the normal distribution function. Linear interpolation is exact to 1e-7.
 
     Importing ``scipy.special`` for it would take 0.2 s of every start.
     """
@@ -348,7 +348,7 @@ Floats = NDArray[np.float32]
 class Qcmos:
     """A qCMOS camera.
 
-    Photoelectrons and dark current fill the pixel's well; its own gain, read noise and offset follow,
+    Photoelectrons and dark current fill the pixel's well. Its own gain, read noise and offset follow,
     then an analogue-to-digital converter of 16 bit. Pixels are binned after that.
     """
 

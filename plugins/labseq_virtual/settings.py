@@ -1,7 +1,7 @@
 """Settings of the simulation and of every virtual device.
 
 "Paper" is Tian et al., "Parallel assembly of arbitrary defect-free atom arrays
-with a multi-tweezer algorithm"; "derived" is computed from its numbers; "ours" is our
+with a multi-tweezer algorithm". "derived" is computed from its numbers. "ours" is our
 choice where the paper gives no value.
 """
 
@@ -30,15 +30,15 @@ PositiveLength = Annotated[Length, Field(gt=0)]
 
 
 class QcmosSettings(Settings):
-    """A qCMOS camera: no EM register, little read noise, each pixel with its own amplifier.
+    """A qCMOS camera, with little read noise, an amplifier for each pixel and no EM register.
 
     "Hamamatsu" marks values quoted for the ORCA-Quest C15550-20UP and its successor.
     """
 
     quantum_efficiency: PositiveFloat = Field(
         default=0.6,
-        description="quantum efficiency relative to the EMCCD's, which the photoelectrons of atoms and "
-        "background belong to (ours: about a half against four fifths at 780 nm)",
+        description="quantum efficiency relative to the EMCCD, for which the photoelectrons of atoms and "
+        "background are given (ours: about a half against four fifths at 780 nm)",
     )
     read_noise: NonNegativeFloat = Field(
         default=0.27,
@@ -64,7 +64,7 @@ class QcmosSettings(Settings):
         default=0.006, description="mean dark electrons per pixel and second (ours: Hamamatsu)"
     )
     full_well: PositiveFloat = Field(
-        default=7000.0, description="electrons that a pixel holds (ours: Hamamatsu)"
+        default=7000.0, description="maximum electrons in a pixel (ours: Hamamatsu)"
     )
 
 
@@ -86,21 +86,21 @@ class ImageSettings(Settings):
         default=0.0,
         gt=-0.5,
         lt=1,
-        description="magnification along an axis of the frame over that across, less 1; areas stay (ours)",
+        description="ratio of magnifications along and across an axis, minus 1, at equal area (ours)",
     )
     stretch_angle: Angle = Field(
-        default=0.0, description="direction of that axis, clockwise from the frame's horizontal (ours)"
+        default=0.0, description="direction of this axis, clockwise from the frame's horizontal (ours)"
     )
     barrel: float = Field(
         default=0.0,
         ge=-0.3,
         le=0.3,
-        description="radial distortion about the middle of the sensor: how far its corner moves inwards, "
-        "relative to its distance; it grows with the third power of the distance (ours)",
+        description="radial distortion about the middle of the sensor, as inward shift of its corner "
+        "relative to its distance. The shift grows with the third power of the distance (ours)",
     )
     vignetting: Fraction = Field(
         default=0.0,
-        description="loss of an atom's light at the corner of the sensor; it grows with the square of the "
+        description="loss of an atom's light at the corner of the sensor. It grows with the square of the "
         "distance from the middle (ours)",
     )
     brightness_spread: Fraction = Field(
@@ -114,21 +114,21 @@ class ImageSettings(Settings):
     )
     halo: Fraction = Field(
         default=0.0,
-        description="fraction of an atom's light in wide wings around its spot: density falling as the third "
-        "power of the distance, like the mean of an Airy pattern (ours)",
+        description="fraction of an atom's light in wide wings around its spot, whose density falls as the "
+        "third power of the distance, like the mean of an Airy pattern (ours)",
     )
     halo_width: PositiveLength = Field(
         default=1e-6,
-        description="width w of the wings: beyond a large distance r from the spot lies w / r of their light "
-        "(ours; an ideal lens of NA 0.5 has a halo times its width of 0.16 um)",
+        description="width w of the wings. Beyond a large distance r from the spot is w / r of their light "
+        "(ours, an ideal lens of NA 0.5 has a halo times its width of 0.16 um)",
     )
     exposure: PositiveDuration = Field(
-        default=45e-3, description="exposure that the photoelectrons belong to (paper)"
+        default=45e-3, description="exposure for which the photoelectrons are given (paper)"
     )
     tweezer_light: NonNegativeFloat = Field(
         default=0.0,
         description="mean photoelectrons of the light of a static tweezer of nominal power in that exposure, "
-        "which the camera's filter lets through (ours: none); its spot is as wide as that of an atom",
+        "which the camera's filter lets through (ours: none). Its spot is as wide as an atom's",
     )
     photoelectrons: PositiveFloat = Field(
         default=60.0,
@@ -141,7 +141,7 @@ class ImageSettings(Settings):
     )
     sensor: Literal["emccd", "qcmos"] = Field(
         default="emccd",
-        description="emccd (paper): a camera with the settings below; qcmos: one with those of `qcmos`",
+        description="`emccd` (paper) uses the settings below, and `qcmos` the settings in `qcmos`",
     )
     clock_induced_charge: NonNegativeFloat = Field(
         default=0.005, description="mean spurious electrons per pixel and frame (ours: typical of EMCCDs)"
@@ -150,13 +150,13 @@ class ImageSettings(Settings):
         default=300.0,
         ge=1,
         le=2000,
-        description="mean gain of the EM register where the camera sets none; 1: a plain CCD (ours)",
+        description="mean gain of the EM register if the camera sets none, or 1 for a plain CCD (ours)",
     )
     full_well: float = Field(
-        default=180e3, ge=1000, description="electrons that a pixel holds (ours: typical)"
+        default=180e3, ge=1000, description="maximum electrons in a pixel (ours: typical)"
     )
     register_well: float = Field(
-        default=800e3, ge=1000, description="electrons that a stage of the EM register holds (ours: typical)"
+        default=800e3, ge=1000, description="maximum electrons in a stage of the EM register (ours: typical)"
     )
     read_noise: NonNegativeFloat = Field(
         default=80.0,
@@ -167,18 +167,18 @@ class ImageSettings(Settings):
     )
     offset: NonNegativeFloat = Field(default=500.0, description="counts of a dark pixel (ours)")
     qcmos: QcmosSettings = Field(
-        default=QcmosSettings(), description="the camera if `sensor` is qcmos; ignored otherwise"
+        default=QcmosSettings(), description="the camera if `sensor` is qcmos, otherwise ignored"
     )
 
 
 TWEEZER_EXPOSURE_S = 1e-3
-"""Exposure that the photoelectrons of ``tweezer_image`` belong to (ours)."""
+"""Exposure for which the photoelectrons of ``tweezer_image`` are given (ours)."""
 
 
 class TweezerImageSettings(Settings):
-    """The image of a further camera: the light of the tweezers, and none of atoms.
+    """The image of a further camera, with the light of the tweezers and no light of atoms.
 
-    An industrial camera: read noise of 2 electrons, 0.1 electrons per count, wells of 7000 electrons (ours).
+    An industrial camera with a read noise of 2 electrons, 0.1 electrons per count, wells of 7000 (ours).
     """
 
     frame: tuple[PositiveInt, PositiveInt] = Field(
@@ -194,11 +194,11 @@ class TweezerImageSettings(Settings):
     tweezer_light: NonNegativeFloat = Field(
         default=20e3,
         description="mean photoelectrons of the light of a static tweezer of nominal power in 1 ms (ours: in "
-        "three times this exposure its pixels are saturated); a mobile one gives seven times as many",
+        "three times this exposure its pixels are saturated). A mobile tweezer gives seven times as many",
     )
 
     def image(self) -> ImageSettings:
-        """The settings of a camera of atoms with the same image."""
+        """The settings of a camera for atoms with the same image."""
         sensor = QcmosSettings(
             quantum_efficiency=1.0, read_noise=2.0, electrons_per_adu=0.1, full_well=7000.0
         )
@@ -219,7 +219,7 @@ class ToneComb(Settings):
         default=100e6, description="frequency of the grid's centre (ours)"
     )
     step: Frequency = Field(
-        default=1.6e6, description="frequency from one row or column to the next; negative if it falls (ours)"
+        default=1.6e6, description="step from one row or column to the next, negative if falling (ours)"
     )
 
     @model_validator(mode="after")
@@ -239,41 +239,41 @@ class MobileLightSettings(Settings):
     wavelength: PositiveLength = Field(default=852e-9, description="wavelength (paper)")
     transit_time: Annotated[Duration, Field(ge=1e-6, le=50e-6)] = Field(
         default=10e-6,
-        description="time that the sound takes across the beam in an AOD (1/e^2 of the intensity at both "
-        "ends); it smooths every jump of a tone (ours: 6 mm of slow TeO2)",
+        description="time for the sound to cross the beam in an AOD (1/e^2 of the intensity at both "
+        "ends), which smooths every jump of a tone (ours: 6 mm of slow TeO2)",
     )
     tone_response: Fraction = Field(
         default=0.0,
         lt=0.5,
         description="relative s.d. of the depth that each row's and each column's tone gives at the "
-        "profile's amplitude, fixed for a seed: what a calibration of amplitudes can equalise (ours)",
+        "profile's amplitude, fixed for a seed. A calibration of amplitudes can equalise it (ours)",
     )
     row_tones: ToneComb | None = Field(
         default=None,
-        description="which tones the machine really needs for its rows, whatever the profile believes; none: "
-        "those of the profile's grid (ours)",
+        description="tones that the machine really needs for its rows, whatever the profile says. Default "
+        "the tones of the profile's grid (ours)",
     )
-    column_tones: ToneComb | None = Field(default=None, description="the same for its columns (ours)")
+    column_tones: ToneComb | None = Field(default=None, description="the same for the columns (ours)")
     offset: tuple[Length, Length] = Field(
         default=(0.0, 0.0),
-        description="[along a row, from row to row]: displacement of the mobile tweezers from the sites that "
-        "they are intended for, an error for a calibration to find (ours)",
+        description="[along a row, from row to row], displacement of the mobile tweezers from their intended "
+        "sites, an error for a calibration to find (ours)",
     )
     magnification_error: float = Field(
         default=0.0,
         ge=-0.1,
         le=0.1,
-        description="excess distance of the mobile tweezers from one another, as a fraction; likewise (ours)",
+        description="relative excess distance between mobile tweezers, as a fraction (ours)",
     )
     tone_error: NonNegativeLength = Field(
         default=0.0,
-        description="s.d. of the position error of each row's and each column's tone, fixed for a seed; "
-        "likewise (ours)",
+        description="s.d. of the position error of each row's and each column's tone, fixed for a seed, "
+        "for a calibration to find (ours)",
     )
 
 
 class LightSettings(Settings):
-    """Which lines of the profile each kind of light needs, all of them at once."""
+    """The lines of the profile that each kind of light needs, all of them at once."""
 
     loading: tuple[str, ...] = Field(default=(), description="lines without which no atoms load (ours)")
     cooling: tuple[str, ...] = Field(
@@ -289,7 +289,7 @@ TRANSITION_HZ = 6.83468261e9
 
 
 class QubitSettings(Settings):
-    """The two levels of each atom: their drive, their decay, and the light that removes atoms."""
+    """The two levels of each atom, with their drive, their decay, and the light that removes atoms."""
 
     drive: str = Field(default="microwave", description="line that switches the drive on")
     quadrature: str = Field(
@@ -301,15 +301,15 @@ class QubitSettings(Settings):
     )
     source: str = Field(
         default="synthesizer",
-        description="device with the frequency and phase of the drive, a `virtual_synthesizer`; without "
-        "one it is on resonance",
+        description="device with the frequency and phase of the drive, a `virtual_synthesizer`. Without "
+        "one the drive is on resonance",
     )
     transition: Annotated[Frequency, Field(gt=0)] = Field(
         default=TRANSITION_HZ,
         description="frequency of the transition (ours: the clock transition of rubidium 87, without shifts)",
     )
     rabi_frequency: Annotated[Frequency, Field(ge=0)] = Field(
-        default=20e3, description="frequency on resonance: a pi pulse takes half of its inverse (ours)"
+        default=20e3, description="Rabi frequency on resonance. A pi pulse takes half of its inverse (ours)"
     )
     relaxation_time: PositiveDuration = Field(
         default=20e-3, description="time constant T1 with which the populations become equal (ours)"
@@ -329,7 +329,7 @@ class QubitSettings(Settings):
         default=5e-6, description="time constant with which push-out light removes atoms (ours)"
     )
     push_out_time_other: PositiveDuration = Field(
-        default=5e-3, description="the same for atoms in the lower level, which it should not remove (ours)"
+        default=5e-3, description="time constant for the lower level, which it should not empty (ours)"
     )
 
     @property
@@ -343,7 +343,7 @@ class QubitSettings(Settings):
         return tuple(getattr(self, key) for key in ("drive", "quadrature", "push_out") if self.is_given(key))
 
     def is_given(self, key: str) -> bool:
-        """Whether the profile has a setting itself."""
+        """Whether the profile itself contains a setting."""
         return key in self.model_fields_set
 
 
@@ -364,31 +364,31 @@ class SimulationSettings(Settings):
     imaging_loss: Fraction = Field(
         default=0.00314,
         lt=1,
-        description="loss in one exposure of 45 ms beyond the lifetime's; longer ones lose at the same "
+        description="loss in one exposure of 45 ms beyond the lifetime's. Longer exposures have the same "
         "rate (derived: with the lifetime it gives the paper's survival of 99.55 %)",
     )
     imaging_loss_exposure: PositiveDuration = Field(
-        default=45e-3, description="exposure that the imaging loss belongs to (paper)"
+        default=45e-3, description="exposure for which the imaging loss is given (paper)"
     )
     transport_loss: Fraction = Field(
         default=0.0188,
-        description="mean loss of an atom that is moved, beside what its motion in the light loses (derived: "
+        description="mean loss of a moved atom, in addition to losses from its motion in the light (derived: "
         "gives about the paper's filling of 97.66 % after one cycle at a degree of parallelism of 7)",
     )
     transport_loss_spread: NonNegativeFloat = Field(
         default=0.5,
-        description="spread of the transport loss from shot to shot: s.d. of the logarithm of a log-normal "
+        description="spread of the transport loss from shot to shot, s.d. of the logarithm of a log-normal "
         "factor with mean 1 (ours: independent losses would leave a third of the paper's defect-free shots "
         "after one cycle)",
     )
     machine_seed: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
         default=None,
-        description="seed of what stays the same from run to run: depths, errors of tones, the camera's "
-        "own patterns; none: the seed of the run. Calibrations hold for one machine only (ours)",
+        description="seed of the machine's properties, such as depths, errors of tones and the camera's "
+        "patterns. Default the seed of the run. Calibrations are valid for one machine only (ours)",
     )
     record_truth: bool = Field(
         default=False,
-        description="record the atoms that were really there in each exposure: the table `atom_events/atoms` "
+        description="record the true atoms in each exposure, as the table `atom_events/atoms` "
         "of each shot (ours)",
     )
     depth_disorder: Fraction = Field(
@@ -399,15 +399,15 @@ class SimulationSettings(Settings):
         default=0.0,
         lt=0.5,
         description="relative s.d. of the depth that each row's and each column's tone of the static "
-        "tweezers gives at equal amplitude, fixed for a seed: what a calibration can equalise (ours)",
+        "tweezers gives at equal amplitude, fixed for a seed. A calibration can equalise it (ours)",
     )
     static_depth: PositiveTemperature = Field(
         default=300e-6, description="mean depth of the static tweezers (paper)"
     )
     static_waist: PositiveLength = Field(
-        default=0.98e-6, description="1/e^2 radius of their intensity (paper)"
+        default=0.98e-6, description="1/e^2 radius of the static tweezers' intensity (paper)"
     )
-    static_wavelength: PositiveLength = Field(default=808e-9, description="their wavelength (paper)")
+    static_wavelength: PositiveLength = Field(default=808e-9, description="static wavelength (paper)")
     temperature: PositiveTemperature = Field(
         default=15e-6,
         description="temperature of the atoms in the static tweezers, at most half of `static_depth` (ours: "
@@ -415,8 +415,8 @@ class SimulationSettings(Settings):
     )
     scattering_rate: NonNegativeFloat = Field(
         default=33e3,
-        description="photons that an atom scatters per second of an exposure; their recoil heats it, while "
-        "the light cools, too (derived from 60 photoelectrons in 45 ms: an NA of 0.5 collects 6.7 %, of "
+        description="photons that an atom scatters per second of an exposure. Their recoil heats it, while "
+        "the light also cools (derived from 60 photoelectrons in 45 ms: an NA of 0.5 collects 6.7 %, of "
         "which optics and sensor count 60 %, ours)",
     )
     cooling_time: PositiveDuration = Field(
@@ -426,27 +426,27 @@ class SimulationSettings(Settings):
     pair_survival: Fraction | None = Field(
         default=None,
         description="probability that collisions in the cooling light leave one of two atoms that come into "
-        "one tweezer; none: 2 - 1 / `loading`, at least 0 (derived: loading ends with such collisions). "
+        "one tweezer. Default 2 - 1 / `loading`, at least 0 (derived: loading ends with such collisions). "
         "Without cooling light both are lost in the next exposure",
     )
     intensity_noise: NonNegativeFloat = Field(
         default=0.0,
         description="power spectral density of the relative noise of the tweezers' intensity at twice the "
-        "trap frequency, in 1/Hz; it heats atoms that are not cooled (ours)",
+        "trap frequency, in 1/Hz, which heats atoms that are not cooled (ours)",
     )
     mobile_light: MobileLightSettings = Field(
         default=MobileLightSettings(), description="the mobile tweezers' light"
     )
     lights: LightSettings = Field(
-        default=LightSettings(), description="which lines each kind of light needs; none: it is always on"
+        default=LightSettings(), description="lines that each kind of light needs (default: always on)"
     )
     qubit: QubitSettings = Field(
-        default=QubitSettings(), description="the two levels of the atoms, and what acts on them"
+        default=QubitSettings(), description="the two levels of the atoms, and their drive and decay"
     )
-    image: ImageSettings = Field(default=ImageSettings(), description="what the camera sees")
+    image: ImageSettings = Field(default=ImageSettings(), description="the images of the atoms' camera")
     tweezer_image: TweezerImageSettings = Field(
         default=TweezerImageSettings(),
-        description="what a device with `role: camera` sees: the light of the tweezers",
+        description="the images of a device with `role: camera`, which sees the light of the tweezers",
     )
 
     @model_validator(mode="after")
@@ -454,30 +454,30 @@ class SimulationSettings(Settings):
         if self.temperature > self.static_depth / 2:
             hot, depth = (format_quantity(k, "temperature") for k in (self.temperature, self.static_depth))
             text = f"temperature is {hot}, too hot for tweezers with a static_depth of {depth}"
-            raise ValueError(f"{text}; expected at most half of it: hotter atoms evaporate")
+            raise ValueError(f"{text}; expected at most half of it, because hotter atoms evaporate")
         return self
 
 
 class CameraFaults(Settings):
-    """Simulated failures; none by default."""
+    """Simulated failures. None by default."""
 
     transient: Fraction = Field(
         default=0.0,
-        description="probability that a frame is lost with an error that calls for a repeated shot",
+        description="probability that a frame is lost with an error after which the shot is repeated",
     )
     missed_trigger: Fraction = Field(
         default=0.0, description="probability that a trigger is missed, so that no frame comes"
     )
     lost_in_series: Fraction = Field(
         default=0.0,
-        description="probability that a frame never comes, which shows in the number of the next one",
+        description="probability that a frame never comes, which the number of the next frame shows",
     )
     late: Fraction = Field(default=0.0, description="probability that a frame comes late")
     late_by: Duration = Field(default=2.0, description="delay of a late frame")
 
 
 class CameraSettings(camera.CameraSettings):
-    """The virtual camera; what it sees is set in the simulation."""
+    """The virtual camera. The simulation has the settings of its images."""
 
     readout: Duration = Field(
         default=5e-3,
@@ -488,17 +488,17 @@ class CameraSettings(camera.CameraSettings):
         default=None,
         ge=1,
         le=1000,
-        description="mean gain of the EM register in a series, 1 between them; none: the simulation's "
+        description="mean gain of the EM register in a series, 1 between series. Default the simulation's "
         "`image.em_gain` at all times",
     )
     cooling: Cooling | None = Field(
-        default=None, description="target temperature before the first shot; none: no cooling"
+        default=None, description="target temperature before the first shot (default: no cooling)"
     )
     faults: CameraFaults = Field(default=CameraFaults(), description="simulated failures")
 
 
 class StaticTweezersSettings(Settings):
-    """The virtual static tweezers have no settings; their depth and light are those of the simulation."""
+    """The virtual static tweezers have no settings. The simulation sets their depth and light."""
 
 
 class MobileTweezersSettings(Settings):
@@ -511,13 +511,11 @@ class MobileTweezersSettings(Settings):
 
 
 class DeviceSettings(Settings):
-    """A virtual instrument; in a dry run it replaces one whose driver has no simulator."""
+    """A virtual instrument. In a dry run it replaces an instrument whose driver has no simulator."""
 
-    commands: tuple[str, ...] = Field(
-        default=(), description="names of its commands; none: it accepts every command"
-    )
+    commands: tuple[str, ...] = Field(default=(), description="names of its commands (default: any)")
     values: dict[str, bool | int | float | str] = Field(
-        default={}, description="values that can be read: name -> value at the start"
+        default={}, description="values that can be read, as name -> initial value"
     )
 
 
@@ -525,7 +523,7 @@ class LinesSettings(Settings):
     """A virtual timing box."""
 
     n_channels: PositiveInt = Field(default=32, description="number of outputs, counted from 0 (ours)")
-    resolution: Duration = Field(default=0.0, description="step of its clock; 0: any time is possible (ours)")
+    resolution: Duration = Field(default=0.0, description="step of its clock, or 0 for any time (ours)")
     shortest: Duration = Field(default=1e-6, description="shortest time between two edges (ours)")
     max_edges: PositiveInt = Field(default=1000, description="maximum number of edges of a program (ours)")
 
@@ -540,7 +538,7 @@ class SynthesizerSettings(Settings):
     phase: Angle = Field(default=0.0, description="phase until it is set")
     shift: Angle = Field(
         default=math.pi / 2,
-        description="what a line adds to the phase, until it is set: see `qubit.quadrature` of the "
+        description="phase that a line adds, until it is set, see `qubit.quadrature` of the "
         "simulation (ours)",
     )
 

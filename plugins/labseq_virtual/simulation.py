@@ -1,4 +1,4 @@
-"""The simulation of one run: atoms in static tweezers, and what light, tweezers and the camera do to them."""
+"""The simulation of one run: atoms in static tweezers, and the effects of light, tweezers and the camera."""
 
 from __future__ import annotations
 
@@ -46,26 +46,25 @@ if TYPE_CHECKING:
     from labseq_virtual.qubits import Qubits
 
 MIN_LEVEL: Final = 1e-3
-"""Depth, relative to the nominal one, below which a static tweezer counts as having this one."""
+"""Depth, relative to the nominal one, that a static tweezer has at least in the model."""
 NO_RISK: Final = 1e-4
-"""Probability of evaporation below which it is left out."""
+"""Probability of evaporation below which evaporation is ignored."""
 UNCOOLED: Final = 3.0
-"""Transport loss without cooling light, relative to that with it (ours)."""
+"""Transport loss without cooling light, relative to the loss with cooling light (ours)."""
 ROUNDING_S: Final = 1e-6
-"""Tolerance for events out of order, in seconds: sums of times are rounded."""
+"""Tolerance for events out of order, in seconds, because sums of times are rounded."""
 
 
 class VirtualSimulation(Simulation):
     """Atoms in static tweezers, the effect of light on them, and the frames that a camera takes of them.
 
-    Events arrive in the order of time. A program of the mobile tweezers acts on the atoms when it has
-    ended; playing a program without segments stops it early, and atoms in flight are lost. A ramp of the
+    Events arrive in order of time. A program of the mobile tweezers acts on the atoms when it has
+    ended. Playing a program without segments stops it early, and atoms in flight are lost. A ramp of the
     static tweezers that comes during a program or an exposure acts at its end.
 
-    Atoms fly in the light of the mobile tweezers (``flight.py``). Its tones are those of the program that a
-    driver passes, played exactly; or the driver connects its RF outputs, and the simulation finds the tones
-    in the samples that were played. Static tweezers likewise either pass their ramps, or connect outputs
-    whose tones are measured.
+    Atoms fly in the light of the mobile tweezers (``flight.py``). Either a driver passes a program, whose
+    tones are played exactly, or it connects its RF outputs, and the simulation finds the tones in the played
+    samples. Likewise, static tweezers either pass their ramps, or connect outputs whose tones are measured.
     """
 
     def __init__(self, settings: SimulationSettings, context: Context) -> None:
@@ -95,22 +94,22 @@ class VirtualSimulation(Simulation):
         return self._settings.image.frame
 
     def readout_fraction(self, mode: SensorMode) -> float:
-        """Time to read a frame, relative to that of the whole sensor without binning."""
+        """Time to read a frame, relative to the whole sensor without binning."""
         return View.of(self._settings.image, mode).readout_fraction
 
     def seen_by(self, camera: str) -> TweezerView:
-        """The view of any camera but that of the atoms: the light of the tweezers."""
+        """The view of any camera other than the atoms' camera, which shows the light of the tweezers."""
         del camera
         settings, seed = self._settings.tweezer_image, self._seed
         return TweezerView(self, self._mobile_light, self._grid, settings, seed, self._random)
 
     def prepare_sensor(self, mode: SensorMode) -> None:
-        """Compute what all frames of a mode have in common, and load the kernels."""
+        """Compute the data shared by all frames of a mode, and load the kernels."""
         importlib.import_module("labseq_virtual.image_kernels")
         self._exposure.prepare(mode)
 
     def warnings(self) -> list[str]:
-        """A speed at which the light of the mobile tweezers is not known."""
+        """A warning about a speed at which the light of the mobile tweezers is not known."""
         transit_s = self._settings.mobile_light.transit_time
         sites = sites_in_transit(self._grid, self._motion, transit_s)
         if sites <= MAX_SITES:
@@ -118,7 +117,7 @@ class VirtualSimulation(Simulation):
         fastest = self._motion.speed_m_s * MAX_SITES / sites
         came, last = (format_quantity(each, "speed") for each in (self._motion.speed_m_s, fastest))
         what = f"profile.mobile_tweezers.speed is {came}; above {last} the sound's chirp blurs the tweezers"
-        return [f"{what}: that more atoms are lost is right, how many is not to be trusted"]
+        return [f"{what}, so more atoms are lost, but the number is not reliable"]
 
     @property
     def loading_probability(self) -> float:
@@ -126,7 +125,7 @@ class VirtualSimulation(Simulation):
         return self._settings.loading
 
     def open(self) -> None:
-        """Draw the machine's own disorder; no atoms, static tweezers off."""
+        """Draw the machine's own disorder, without atoms and with the static tweezers off."""
         machine = RandomStream(self._seed).machine()
         self._static.draw(machine)
         self._positions.draw(machine)
@@ -152,7 +151,7 @@ class VirtualSimulation(Simulation):
         self._reset()
         if self._pulse_receiver is not None:
             for _ in self._pulse_receiver.receive_until(self._clock.now()):
-                pass  # light before the shot acts on no atoms
+                pass  # light before the shot has no atoms to act on
         self._flights.begin_shot()
         spread = self._settings.transport_loss_spread
         self._loss_factor = math.exp(spread * self._random.shot.standard_normal() - spread**2 / 2)
@@ -161,7 +160,7 @@ class VirtualSimulation(Simulation):
         """Load every site whose static tweezer is on.
 
         A site is reloaded with probability 1 - exp(-duration / loading_time), and then holds an atom
-        with probability ``loading``; otherwise it stays as it was.
+        with probability ``loading``. Otherwise it stays as it was.
 
         Raises:
             DeviceError: A later event has already been simulated.
@@ -209,14 +208,14 @@ class VirtualSimulation(Simulation):
         self._lights.wire(role, on_pulse)
 
     def tune(self, device: str, values: Mapping[str, float]) -> None:
-        """Set what a synthesizer puts out: "frequency" in Hz, "phase" and "shift" in rad."""
+        """Set the output of a synthesizer, "frequency" in Hz, "phase" and "shift" in rad."""
         self._sources[device] = values
 
     def connect_outputs(self, role: str, source: RfSource | ToneSource) -> None:
         """Connect the outputs of a driver of tweezers, in place of earlier ones.
 
         Raises:
-            DeviceError: The role is not one of tweezers.
+            DeviceError: The role is not mobile or static tweezers.
             LimitError: Tones of neighbouring sites could not be resolved.
         """
         self._check_open()
@@ -235,7 +234,7 @@ class VirtualSimulation(Simulation):
         )
 
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
-        """Take a frame; imaging light heats some atoms out of their tweezers, and they shine until then.
+        """Take a frame. Imaging light heats some atoms out of their tweezers, and they shine until then.
 
         Raises:
             DeviceError: A later event has already been simulated.
@@ -274,15 +273,15 @@ class VirtualSimulation(Simulation):
         }
 
     def spot_powers(self) -> NDArray[np.float64]:
-        """Power of each static tweezer now relative to the nominal one, float64 (n_rows, n_cols)."""
+        """Present power of each static tweezer relative to the nominal one, float64 (n_rows, n_cols)."""
         self._check_open()
         self._apply_output(self._clock.now())
         return self._static.depth
 
     def tweezer_light(self) -> tuple[NDArray[np.float64], MobileTones | None]:
-        """Power of each static tweezer now, as ``spot_powers``, and the mobile tweezers' tones that are on.
+        """Present power of each static tweezer, as ``spot_powers``, and the mobile tweezers' active tones.
 
-        It may be asked for while a program of the mobile tweezers is played.
+        May be called while a program of the mobile tweezers is played.
         """
         self._check_open()
         now_s = self._clock.now()
@@ -302,7 +301,7 @@ class VirtualSimulation(Simulation):
         """The atoms of this shot, as far as they are recorded.
 
         Returns:
-            "atoms" (:data:`labseq_virtual.atoms.ATOMS`) with ``record_truth``; "flights"
+            "atoms" (:data:`labseq_virtual.atoms.ATOMS`) with ``record_truth``, and "flights"
             (:data:`labseq_virtual.flight.FLIGHTS`) and "jumps" (:data:`labseq_virtual.flight.JUMPS`) if the
             outputs of the mobile tweezers are connected.
         """
@@ -318,7 +317,7 @@ class VirtualSimulation(Simulation):
 
     def _play_tones(self, program: ToneProgram, t_start_s: float) -> None:
         self._finish_program(t_start_s)
-        if program.n_segments == 0:  # silence: allowed at any time, as it is the safe state
+        if program.n_segments == 0:  # silence, allowed at any time because it is the safe state
             return
         self._begin_event(t_start_s, "a program of the mobile tweezers")
         self._playing = RunningProgram(program, t_start_s)
@@ -347,7 +346,7 @@ class VirtualSimulation(Simulation):
         return bool(self._settings.lights.cooling) and self._lights.fraction_on("cooling", start_s, end_s) > 0
 
     def _drive(self) -> Mapping[str, float]:
-        """What drives the atoms: the output of the source, or resonance without one.
+        """The drive of the atoms, from the output of the source, or on resonance without a source.
 
         Raises:
             DeviceError: The source is not a synthesizer of this profile.
@@ -394,12 +393,12 @@ class VirtualSimulation(Simulation):
         self._lost += self._static.receive_until(until_s, self._atoms, self._random.shot)
 
     def _conditions(self, start_s: float, end_s: float) -> Conditions:
-        """Cooling light between two times, and the factor on the transport loss: more without that light."""
+        """Cooling light between two times, and the factor on the transport loss, which rises without it."""
         cooled = self._lights.fraction_on("cooling", start_s, end_s)
         return Conditions(self._loss_factor * (cooled + (1.0 - cooled) * UNCOOLED), cooled)
 
     def _begin_event(self, t_s: float, what: str) -> None:
-        """Simulate everything before an event; refuse one that comes before the end of another."""
+        """Simulate everything before an event. Refuse an event before the end of another."""
         self._check_open()
         self._apply_output(t_s)
         if self._playing is not None and t_s >= self._playing.t_end_s - ROUNDING_S:
@@ -411,7 +410,7 @@ class VirtualSimulation(Simulation):
         self._lose_to_vacuum(t_s)
 
     def _lose_to_vacuum(self, t_s: float) -> None:
-        """Advance the time to ``t_s``; atoms are lost at the rate of the vacuum lifetime."""
+        """Advance the time to ``t_s``. Atoms are lost at the rate of the vacuum lifetime."""
         elapsed_s = max(0.0, t_s - self._now_s)
         self._now_s = max(self._now_s, t_s)
         if not self._atoms.occupied.any():  # includes the first event, before which elapsed_s is infinite
@@ -424,18 +423,18 @@ class VirtualSimulation(Simulation):
         self._lost["vacuum"] += self._atoms.lose(self._random.shot.random(self._grid.shape) >= stays)
 
     def _relaxed(self, heat: NDArray[np.float64], elapsed_s: NDArray[np.float64], cooled: float) -> Any:
-        """Temperatures after times in the static tweezers: cooled, or heated by noise of the intensity."""
+        """Temperatures after times in the static tweezers, cooled or heated by intensity noise."""
         if cooled > 0:
             aim = self._at_nominal(self._settings.temperature)
             return aim + (heat - aim) * np.exp(-elapsed_s * cooled / self._settings.cooling_time)
         return heat * np.exp(np.minimum(elapsed_s * self._noise_hz, 20.0))
 
     def _at_nominal(self, temperature: float) -> NDArray[np.float64]:
-        """Temperature that atoms of a given one would have in tweezers ramped to the nominal depth."""
+        """Temperature that atoms at a temperature would have in tweezers ramped to the nominal depth."""
         return temperature / np.sqrt(np.maximum(self._static.depth, MIN_LEVEL))
 
     def _evaporate(self) -> None:
-        """Remove atoms that noise has heated beyond the depth, with the energies of a harmonic well."""
+        """Remove atoms that noise has heated beyond the depth, with energies as in a harmonic well."""
         if self._noise_hz == 0:
             return
         depth = self._settings.static_depth * np.maximum(self._static.depth, MIN_LEVEL)

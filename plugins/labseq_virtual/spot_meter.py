@@ -26,16 +26,16 @@ class VirtualSpotMeter(VirtualDriver, Device):
         self._settings = settings
 
     def safe_state(self) -> None:
-        """Do nothing: the meter only measures."""
+        """Do nothing, because the meter only measures."""
 
     def check_command(self, name: str, **arguments: Any) -> None:
-        """Refuse: the meter has no commands.
+        """Refuse every command, because the meter has none.
 
         Raises:
             DeviceError: Always.
         """
         del arguments
-        raise DeviceError(self._name, f"unknown command '{name}'; it only measures: read '{VALUE}'")
+        raise DeviceError(self._name, f"unknown command '{name}'; the meter only measures, so read '{VALUE}'")
 
     command = check_command
 
@@ -48,7 +48,7 @@ class VirtualSpotMeter(VirtualDriver, Device):
         self._check_open()
         if name != VALUE:
             raise DeviceError(self._name, f"unknown value '{name}'; expected '{VALUE}'")
-        self._clock.sleep(20e-3)  # of a measurement (ours)
+        self._clock.sleep(20e-3)  # duration of a measurement (ours)
         powers: NDArray[np.float64] = self._simulation.spot_powers()  # pyright: ignore[reportAttributeAccessIssue]
         return powers * (1 + self._settings.noise * self._random.shot.standard_normal(powers.shape))
 

@@ -19,12 +19,12 @@ Sites = NDArray[np.intp]
 
 
 SLOWEST_S: Final = 10e-3
-"""Longest ramp that is simulated: 90 periods along the beam at 300 uK; slower ones are as gentle (ours)."""
+"""Longest simulated ramp, 90 periods along the beam at 300 uK. Slower ramps are as gentle (ours)."""
 OFF: Final = 5e-3
-"""Depth over that before a ramp below which nothing stays: gravity, left out here, empties it (ours)."""
+"""Ratio of depths after and before a ramp below which no atom stays, due to gravity (not modelled, ours)."""
 HOLDING: Final = 0.1
-"""Depth, as a fraction of the nominal one, below which a static tweezer loads no atom, and loses its own if
-it came there without a ramp (ours)."""
+"""Depth, as a fraction of the nominal one, below which a static tweezer loads no atom, and loses its atom if
+this depth was reached without a ramp (ours)."""
 
 
 class StaticArray:
@@ -33,8 +33,8 @@ class StaticArray:
     At full power the depth of a site is the product of the powers of its row tone and its column tone, of
     the AODs' response to these tones (``tone_response``), and of the site's own disorder
     (``depth_disorder``), which no choice of amplitudes corrects. The power of a tone is proportional to its
-    amplitude squared; equal amplitudes that add up to full scale give the nominal depth. Where no tones make
-    the tweezers, their powers come in place of those of tones and response.
+    amplitude squared. Equal amplitudes that add up to full scale give the nominal depth. If no tones make
+    the tweezers, the powers of the sites replace the product of tones and response.
     """
 
     def __init__(self, grid: SiteGrid, settings: SimulationSettings) -> None:
@@ -47,7 +47,7 @@ class StaticArray:
         self._source: ToneSource | None = None
 
     def draw(self, random: np.random.Generator) -> None:
-        """Draw the machine's disorder; the light is off, the amplitudes are equal."""
+        """Draw the machine's disorder, with the light off and equal amplitudes."""
         n_rows, n_cols = self._grid.shape
         disorder = random.standard_normal((n_rows, n_cols))
         self._site = np.maximum(0.0, 1.0 + self._settings.depth_disorder * disorder)
@@ -60,11 +60,11 @@ class StaticArray:
 
     @property
     def depth(self) -> Floats:
-        """Depth of each site now, float64 (n_rows, n_cols)."""
+        """Present depth of each site, float64 (n_rows, n_cols)."""
         return (0.0 if self._is_blocked else self._level) * self._site * self._power
 
     def holds(self) -> NDArray[np.bool_]:
-        """Which sites are deep enough to hold an atom, bool (n_rows, n_cols)."""
+        """Sites that are deep enough to hold an atom, bool (n_rows, n_cols)."""
         return self.depth >= HOLDING
 
     def switch_off(self) -> None:
@@ -73,12 +73,12 @@ class StaticArray:
         self._source = None
 
     def connect_outputs(self, source: ToneSource) -> None:
-        """From now on the depths follow what these outputs play."""
+        """Make the depths follow the played signal of these outputs from now on."""
         self._power = np.zeros(self._grid.shape)
         self._source, self._level = source, 1.0
 
     def receive_until(self, until_s: float, atoms: Atoms, rng: np.random.Generator) -> Counter[str]:
-        """Apply the output played until a time; in a release of it atoms have the temperature of cooled ones.
+        """Apply the output played until a time. In its releases atoms have the temperature of cooled atoms.
 
         Returns:
             Number of atoms lost in tweezers that were too shallow ("light"), and in releases ("release").
@@ -102,7 +102,7 @@ class StaticArray:
         self._power = np.outer(rows, cols)
 
     def block(self, atoms: Atoms, *, is_blocked: bool) -> int:
-        """Block the light by a line that turns it off, or let it pass.
+        """Block the light by a line that turns it off, or let the light pass.
 
         Returns:
             Number of atoms lost.
@@ -115,11 +115,11 @@ class StaticArray:
     def release(self, dark_s: float, atoms: Atoms, rng: np.random.Generator) -> int:
         """Let the atoms fly while the light is off, and recapture those that the same tweezer then binds.
 
-        Atoms fly straight on: gravity and neighbouring tweezers are left out.
+        Atoms fly straight, without gravity and neighbouring tweezers.
 
         Args:
-            dark_s: How long the light is off.
-            atoms: The atoms; changed in place.
+            dark_s: Time without light.
+            atoms: The atoms. Changed in place.
             rng: Random numbers of the shot.
 
         Returns:
@@ -138,7 +138,7 @@ class StaticArray:
         return int(np.count_nonzero(~bound))
 
     def ramp(self, ramp: DepthRamp, atoms: Atoms, rng: np.random.Generator) -> int:
-        """Change the depth; atoms too hot for tweezers that become shallower are lost; returns how many."""
+        """Change the depth, lose atoms too hot for shallower tweezers, and return their number."""
         before = np.count_nonzero(atoms.occupied)
         for start, end, duration_s in (
             (self._level, ramp.start, 0.0),
@@ -151,7 +151,7 @@ class StaticArray:
         return int(before - np.count_nonzero(atoms.occupied))
 
     def _lower(self, fraction: float, duration_s: float, atoms: Atoms, rng: np.random.Generator) -> None:
-        """Let atoms fly while their tweezers become shallower; those that are unbound at the end are lost."""
+        """Let atoms fly while their tweezers become shallower, and lose the unbound ones at the end."""
         from labseq_virtual.atom_kernels import ramp_atoms
         from labseq_virtual.flight_kernels import COLDEST
 
@@ -161,7 +161,7 @@ class StaticArray:
         before = ramp_atoms(state, depth, 1.0, 0.0, *self._beam) + depth
         after = ramp_atoms(state, depth, fraction, min(duration_s, SLOWEST_S), *self._beam)
         atoms.occupied[row, col] = after < 0
-        # the energy goes as the trap frequency if the change is slow
+        # the energy is proportional to the trap frequency if the change is slow
         change = (after + fraction * depth) / np.sqrt(max(fraction, 1e-12)) - before
         heat = atoms.heat[row, col]
         atoms.heat[row, col] = np.maximum(heat + change / 3 / KELVIN / np.sqrt(level), COLDEST * heat)
@@ -175,7 +175,7 @@ class StaticArray:
     def _draw(
         self, atoms: Atoms, row: Sites, col: Sites, rng: np.random.Generator
     ) -> tuple[Floats, Floats, Floats]:
-        """Draw atoms in their tweezers; also returns the depths per mass, and relative to the nominal one."""
+        """Draw atoms in their tweezers. Also returns depths per mass, and relative to the nominal depth."""
         from labseq_virtual.atom_kernels import draw_atoms
 
         level = self.depth[row, col]

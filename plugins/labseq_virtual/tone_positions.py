@@ -1,4 +1,4 @@
-"""Where the tones of the mobile tweezers put their light, in sites."""
+"""Positions of the light of the mobile tweezers' tones, in sites."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BEYOND: Final = 1000
 
 
 class FrequencyMap:
-    """Frequency -> position along an axis, in sites; extrapolated beyond the grid with the outermost step.
+    """Frequency -> position along an axis, in sites. Extrapolated beyond the grid with the outermost step.
 
     Args:
         frequency_hz: float64 (n_sites,), rising or falling.
@@ -51,7 +51,7 @@ class FrequencyMap:
 class TonePositions:
     """The true positions of row and column tones, with the errors that a calibration has to find.
 
-    The grid says where each tone is intended to be. The true position follows from the machine's own tones,
+    The grid gives the intended position of each tone. The true position follows from the machine's own tones,
     if the settings give them, a common offset, a magnification, and an error of each tone (``settings.py``,
     ``mobile_light``).
     """

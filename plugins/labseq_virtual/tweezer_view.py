@@ -1,4 +1,4 @@
-"""The simulation as a camera sees it that looks at the light of the tweezers."""
+"""The view of a camera that images the light of the tweezers."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from labseq_virtual.sensors import View
 from labseq_virtual.settings import TweezerImageSettings
 
 DEEPER: Final = 7.0
-"""Light of a mobile tweezer over that of a static one: it is as much deeper (paper: 2.1 mK and 0.3 mK)."""
+"""Light of a mobile tweezer relative to a static one, like the depths (paper: 2.1 mK and 0.3 mK)."""
 
 
 class TweezerSource(Protocol):
-    """The simulation whose tweezers are seen."""
+    """The simulation with the imaged tweezers."""
 
     def tweezer_light(self) -> tuple[NDArray[np.float64], MobileTones | None]:
-        """Power of each static tweezer now, float64 (n_rows, n_cols), and the tones of the mobile ones."""
+        """Present power of each static tweezer, float64 (n_rows, n_cols), and the mobile tweezers' tones."""
         ...
 
 
 class TweezerView(Simulation):
-    """Frames of the tweezers, with the places and powers that they have when an exposure begins.
+    """Frames of the tweezers, with their positions and powers at the start of the exposure.
 
-    The camera receives no light of atoms, and its exposures act on none.
+    The camera receives no light from atoms, and its exposures do not affect them.
 
     Args:
         source: The simulation.
-        mobile: Where the mobile tweezers are.
+        mobile: The light of the mobile tweezers.
         grid: The grid of sites.
-        settings: What the camera sees.
+        settings: Settings of the camera's images.
         seed: Seed of the machine, for the camera's own patterns.
         random: The random numbers of the simulation.
     """
@@ -60,11 +60,11 @@ class TweezerView(Simulation):
         return self._settings.frame
 
     def readout_fraction(self, mode: SensorMode) -> float:
-        """Time to read a frame, relative to that of the whole sensor without binning."""
+        """Time to read a frame, relative to the whole sensor without binning."""
         return View.of(self._settings, mode).readout_fraction
 
     def prepare_sensor(self, mode: SensorMode) -> None:
-        """Compute what all frames of a mode have in common."""
+        """Compute the data shared by all frames of a mode."""
         self._images_of(mode).warm()
 
     def expose(self, t_start_s: float, exposure_s: float, mode: SensorMode = WHOLE_SENSOR) -> Frame:
@@ -101,7 +101,7 @@ class TweezerView(Simulation):
         return self._images[mode]
 
     def open(self) -> None:
-        """Do nothing, like the four methods below: they are the simulation's own."""
+        """Do nothing, like the four methods below, because the simulation itself does it."""
 
     def close(self) -> None:
         """Do nothing."""

@@ -38,7 +38,7 @@ class VirtualDriver(Hardware):
 
     Args:
         context: Name, clock, random numbers and the simulation.
-        role: Name to use where the context has none.
+        role: Name to use if the context has none.
 
     Raises:
         ConfigError: There is no simulation.
@@ -58,13 +58,13 @@ class VirtualDriver(Hardware):
         self._is_open = True
 
     def close(self) -> None:
-        """Make the output harmless and disconnect; legal in any state."""
+        """Make the output harmless and disconnect. Legal in any state."""
         self.safe_state()
         self._is_open = False
 
     @abstractmethod
     def safe_state(self) -> None:
-        """Make the output harmless; legal in any state."""
+        """Make the output harmless. Legal in any state."""
 
     def _check_open(self) -> None:
         if not self._is_open:
@@ -72,7 +72,7 @@ class VirtualDriver(Hardware):
 
 
 def require_simulation(context: Context) -> Simulation:
-    """The simulation that virtual hardware acts on.
+    """The simulation on which virtual hardware acts.
 
     Raises:
         ConfigError: The profile has none.
@@ -87,21 +87,21 @@ def require_simulation(context: Context) -> Simulation:
 _NOTHING: Final = np.empty(0)
 _NO_TONES: Final = AxisTones(np.zeros(1, np.int32), _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING)
 SILENCE: Final = ToneProgram(_NO_TONES, _NO_TONES, _NOTHING, np.empty(0, np.int8), np.empty(0, np.int32))
-"""The program that has no segments: all tones off."""
+"""The program without segments, with all tones off."""
 FULL_SCALE: Final = 1.0
-"""Greatest sum of the amplitudes of an axis: above it the output clips."""
+"""Greatest sum of the amplitudes of an axis, above which the output clips."""
 MAX_DEPTH: Final = 1.5
 """Greatest depth of the static tweezers, as a fraction of the nominal one (ours)."""
 ROUNDING: Final = 1e-9
-"""How far a sum of amplitudes may exceed its limit by rounding."""
+"""Excess of a sum of amplitudes over its limit that counts as rounding."""
 
 
 class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
-    """Ideal mobile tweezers: the atoms feel exactly the tones of the program.
+    """Ideal mobile tweezers, in which the atoms feel exactly the tones of the program.
 
     A program is refused before it plays if it leaves the AOD's band or would clip.
     Each ``play`` needs its own ``prepare``, so no program is replayed by mistake.
-    ``safe_state`` stops a program early: atoms in flight are lost.
+    ``safe_state`` stops a program early, so that atoms in flight are lost.
     """
 
     def __init__(self, settings: MobileTweezersSettings, context: Context) -> None:
@@ -135,7 +135,7 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
             Playing time in seconds.
 
         Raises:
-            LimitError: It has no length, leaves the AOD's band, or clips.
+            LimitError: The program has no length, leaves the AOD's band, or clips.
             DeviceError: Not open, or still playing.
         """
         self._check_open()
@@ -149,16 +149,16 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         """Refuse a program that has no length, leaves the AOD's band, or clips.
 
         Raises:
-            LimitError: It does.
+            LimitError: The program has no length, leaves the AOD's band, or clips.
         """
         band_hz = self._band_hz
         check_tone_program(self._name, program, band_hz, band_hz, FULL_SCALE)
 
     def play(self) -> None:
-        """Start playing the prepared program; returns at once.
+        """Start playing the prepared program, and return at once.
 
         Raises:
-            DeviceError: Nothing was prepared since the last ``play``, or still playing.
+            DeviceError: No program was prepared since the last ``play``, or one is still playing.
         """
         self._check_open()
         self._check_idle("play()")
@@ -171,14 +171,14 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
             self._start(self._clock.now())
 
     def _start(self, t_s: float) -> None:
-        """Start the armed program; without one the edge has no effect."""
+        """Start the armed program. Without a program the edge has no effect."""
         program, self._armed = self._armed, None
         if program is not None:
             self._simulation.play("mobile_tweezers", program, t_s)
             self._playing_until_s = t_s + program.total_duration_s
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for the end of the program; returns at once if none is playing.
+        """Wait for the end of the program. Returns at once if none is playing.
 
         Raises:
             DeviceTimeoutError: It did not end within ``timeout_s``.
@@ -190,21 +190,21 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
         self._clock.sleep(min(left_s, timeout_s))
         if left_s > timeout_s:
             waited, left = format_quantity(timeout_s, "time"), format_quantity(left_s, "time")
-            text = f"still playing after {waited}; the program needed {left}"
+            text = f"still playing after {waited}, but the program needed {left}"
             if self._armed is not None:
                 text = f"no trigger came within {waited}"
             raise DeviceTimeoutError(self._name, text, timeout_s)
         self._playing_until_s = None
 
     def safe_state(self) -> None:
-        """All tones off, at once; the prepared program is dropped."""
+        """Turn all tones off at once, and drop the prepared program."""
         self._prepared = self._armed = None
         if self._playing_until_s is not None:
             self._playing_until_s = None
             self._simulation.play("mobile_tweezers", SILENCE, self._clock.now())
 
     def self_test(self) -> None:
-        """Check that the tones of all sites are in the AOD's band; nothing is played.
+        """Check that the tones of all sites are in the AOD's band, without playing.
 
         Raises:
             DeviceError: Not open, or a site is out of reach.
@@ -252,11 +252,11 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
 
     @property
     def facts(self) -> TweezersFacts:
-        """They release the atoms for exactly the time that is asked for."""
+        """Facts of tweezers that release the atoms for exactly the requested time."""
         return TweezersFacts(shortest_release_s=0.0)
 
     def load(self, amplitudes: Amplitudes | None) -> None:
-        """Set the tone amplitudes of the rows (n_rows,) and columns (n_cols,); None: the calibrated ones.
+        """Set the tone amplitudes of the rows (n_rows,) and columns (n_cols,). None takes calibrated ones.
 
         Raises:
             LimitError: Wrong number of tones, or amplitudes negative, not finite or too large in sum.
@@ -269,7 +269,7 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
         self._simulation.play("static_tweezers", TweezerAmplitudes(rows, cols), self._clock.now())
 
     def start(self) -> None:
-        """Ramp the array to its nominal depth; no effect if it is there."""
+        """Ramp the array to its nominal depth. No effect if it is there."""
         self._check_open()
         if self._depth == 0.0:
             self.load(self._amplitudes)
@@ -277,7 +277,7 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
             self._play(1.0, 0.0)
 
     def ramp(self, depth: float, duration_s: float) -> None:
-        """Change the depth linearly; returns when the ramp has ended.
+        """Change the depth linearly. Returns when the ramp has ended.
 
         Raises:
             LimitError: A depth or duration that the array cannot have.
@@ -288,7 +288,7 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
         self._clock.sleep(duration_s)
 
     def release(self, duration_s: float) -> float:
-        """Turn the light off for exactly this time, then on again; returns when it is on.
+        """Turn the light off for exactly this time, then on again. Returns when the light is on.
 
         Raises:
             LimitError: The duration is not positive, or not finite.
@@ -308,7 +308,7 @@ class VirtualStaticTweezers(VirtualDriver, StaticTweezers):
             self._play(0.0, 0.0)
 
     def self_test(self) -> None:
-        """Check the calibrated amplitudes against the limits; no light is switched on.
+        """Check the calibrated amplitudes against the limits, without switching light on.
 
         Raises:
             DeviceError: Not open, or the amplitudes exceed a limit.

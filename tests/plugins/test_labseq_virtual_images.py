@@ -172,7 +172,7 @@ def test_impossible_settings_are_refused() -> None:
     [
         (SensorMode((0, 500, 20, 20)), {}, r"\[0, 500, 20, 20\]; the limit is its 512 x 512 pixels"),
         (SensorMode((-1, 0, 20, 20)), {}, "the region of the sensor"),
-        (SensorMode((0, 0, 21, 20), 2), {}, "the binning is 2; the limit is what divides the 21 x 20 pixels"),
+        (SensorMode((0, 0, 21, 20), 2), {}, "the binning is 2; the limit is a divisor of the 21 x 20 pixels"),
         (SensorMode(em_gain=30.0), {"sensor": "qcmos"}, "30; the limit is 1"),
     ],
 )

@@ -357,7 +357,7 @@ class AnalysisContract:
 
     @promise("shot() is pure: no I/O, no change of shared state")
     def test_is_pure(self, factory: AnalysisFactory) -> None:
-        """labseq stores the results."""
+        """The results are stored by labseq."""
         analysis = factory(self.context())
         for shot in self.shots().values():
             _result_of(analysis, shot)  # the first call may compile
