@@ -556,7 +556,7 @@ def safe(
         bool | None,
         typer.Option(
             "--end/--no-end",
-            help="First end a process that uses the devices. Default: ask in a terminal, else do so.",
+            help="First end a process that uses the devices. Default: ask in a terminal, otherwise end it.",
             show_default=False,
         ),
     ] = None,
@@ -658,7 +658,7 @@ def leader_test(
     ] = None,
     shots: Annotated[
         int | None,
-        whole_number_option("Also take N shots of the run, at least 3. They move atoms and count."),
+        whole_number_option("Take N shots of the run, at least 3. They move atoms and count as shots."),
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -199,7 +199,7 @@ class Tally:
         n_done: Number of shots completed since the first event.
         n_judged: Number of completed shots that were judged on their last image.
         n_defect_free: Number of judged shots that met the target.
-        n_seen: Number of judged shots that met the target in at least one image.
+        n_seen: Number of completed shots that met the target in at least one image.
         n_repeated: Number of attempts that had to be repeated.
         image: The last image.
         image_shot: Index of the shot of the last image.

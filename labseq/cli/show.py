@@ -232,7 +232,7 @@ def _read_timing(run: Run) -> RunTiming:
 
     timing = timing_of(run, evenly(run.shots, PART_SHOTS))
     if not timing.n_read:
-        what = "the run has no shots yet whose files can be read"
+        what = "the run has no readable file of a shot yet"
         raise ConfigError(Problem(what, visible(str(run.path)), expected="at least one"))
     return timing
 

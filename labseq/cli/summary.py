@@ -219,7 +219,7 @@ def _best_rows(best: BestPoint | None) -> Facts:
     at = ", ".join(f"{clean(address)} {value}" for address, value in best.point.written.items())
     value = f"{title_of(best.quantity)} {value_text(best.value, best.quantity)}"
     suggested = ", ".join(f"{clean(address)} {value}" for address, value in best.suggested.items())
-    source = "a parabola through the points near it" if best.is_fitted else "no parabola fits: the best point"
+    source = "a parabola through the points near it" if best.is_fitted else "best point, as no parabola fits"
     return [("best point", f"{at}: {value}"), ("suggested", f"{suggested} ({source})")]
 
 
@@ -322,7 +322,7 @@ def statistics_rows(results: Statistics | None) -> Facts:
         rows.append(("lost in a shot", ", ".join(causes) or "no atoms"))
     if not math.isnan(results.defects_true.value):
         rows += [
-            ("true defects", f"{results.defects_true} at the end of a shot, as the simulation knows"),
+            ("true defects", f"{results.defects_true} at the end of a shot, known from the simulation"),
             ("seen defects", f"{results.defects_seen} on the last image of a shot"),
         ]
     return rows

@@ -286,7 +286,7 @@ class CameraDriver(Camera):
         elif series.trigger == "software":
             reason = f"frame {n_read} is not ready, although its software trigger was sent"
         else:
-            reason = f"frame {n_read} is not ready, which needs no trigger"
+            reason = f"frame {n_read} needs no trigger, but is not ready"
         text = f"no frame within {format_quantity(timeout_s, 'time')}: {reason}"
         return DeviceTimeoutError(self._name, text, timeout_s)
 
@@ -308,7 +308,7 @@ LOOK_S: Final = 1.0
 def _is_temperature_of_sensors(kelvin: float) -> float:
     if not 150.0 <= kelvin <= 323.0:
         given = f"{format_quantity(kelvin, 'temperature')} ({kelvin - ZERO_CELSIUS_K:.0f} degC)"
-        raise setting_error(f"temperature is {given}", "-123 to 50 degC, as '-70 degC'")
+        raise setting_error(f"temperature is {given}", "-123 to 50 degC, such as '-70 degC'")
     return kelvin
 
 
@@ -542,5 +542,5 @@ def check_step(name: str, value: int, bounds: tuple[int, int, int], unit: int = 
     low, high, step = (unit * bound for bound in bounds)
     good = nearest(value, low, high, step)
     if good != value:
-        limit = f"{low} to {high}, in steps of {step}, as the camera can do"
+        limit = f"{low} to {high}, in steps of {step} for this camera"
         raise LimitError(name, value, limit, f"the nearest possible value is {good}")

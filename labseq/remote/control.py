@@ -156,7 +156,7 @@ class Control:
             raise DeviceError("server", text)
         if message["kind"] != device.kind:
             used = clean(message["kind"])
-            text = f"'{device.name}' is of the kind {device.kind}, and the profile uses it as {used}"
+            text = f"'{device.name}' is of the kind {device.kind}, but the profile uses it as {used}"
             raise DeviceError("server", text)
         if sum(len(other.sessions) for other in self._devices.values()) >= MAX_SESSIONS:
             raise DeviceError("server", f"it already has {MAX_SESSIONS} connections")

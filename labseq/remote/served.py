@@ -332,4 +332,4 @@ class ServedDevice:
 
 def why_ended(ended: dict[bytes, str], token: Any) -> str:
     """Why there is no longer a session with this token."""
-    return ended.get(token, "the connection has ended, or the server was started again")
+    return ended.get(token, "the connection has ended, or the server was restarted")

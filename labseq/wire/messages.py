@@ -265,7 +265,7 @@ def _data(parts: Sequence[Part], place: Any, n_bytes: int, unused: list[int]) ->
     if type(part) is not int or type(begin) is not int or not 1 <= part < len(parts) or begin < 0:
         raise MessageError("an array is missing")
     if begin < unused[part]:
-        raise MessageError("two of its arrays have the same bytes")
+        raise MessageError("two of its arrays share bytes")
     unused[part] = begin + n_bytes
     return memoryview(parts[part])[begin : begin + n_bytes]
 

@@ -260,7 +260,7 @@ class Dialogue:
 
     def _receive_reply(self, request: Request) -> list[str]:
         if request.word != self.awaited:
-            return [self.error(f"'{request.word}' answers nothing that labseq has asked for")]
+            return [self.error(f"labseq has not asked for '{request.word}'")]
         self.awaited, self.reply = "", visible(request.text)
         return []
 

@@ -356,7 +356,7 @@ class SimulationSettings(Settings):
     )
     loading_time: PositiveDuration = Field(
         default=50e-3,
-        description="time constant of the loading (ours: the paper's 500 ms are ten of them)",
+        description="time constant of the loading (ours: a tenth of the paper's 500 ms)",
     )
     lifetime: PositiveDuration = Field(
         default=33.0, description="lifetime of an atom in a tweezer, cooled, exposures included (paper)"

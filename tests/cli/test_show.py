@@ -260,7 +260,7 @@ def test_json_holds_the_same(folder: Path, capsys: pytest.CaptureFixture[str]) -
     ("table", "printed", "json_wanted"),
     [
         (Tables(scan=ScanRequest()), "the run has no shots yet", True),
-        (Tables(timing=True), "no shots yet whose files can be read", False),
+        (Tables(timing=True), "no readable file of a shot yet", False),
     ],
 )
 def test_a_table_without_data_is_reported(

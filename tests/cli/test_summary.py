@@ -86,7 +86,7 @@ def test_the_truth_of_a_simulation_is_reported() -> None:
         defects_seen=Estimate(1.3, 0.2),
     )
     assert printed["lost in a shot"] == "vacuum 3.9(6), hand over 3.5(5)"
-    assert printed["true defects"] == "1.9(3) at the end of a shot, as the simulation knows"
+    assert printed["true defects"] == "1.9(3) at the end of a shot, known from the simulation"
     assert printed["seen defects"] == "1.3(2) on the last image of a shot"
     assert lines(losses={"vacuum": Estimate(0.0, 0.0)})["lost in a shot"] == "no atoms"
 

@@ -147,7 +147,7 @@ def test_a_software_trigger_belongs_to_a_series_with_one() -> None:
         ("software", 1, 0, "frame 0 is not ready, although its software trigger was sent"),
         ("software", 1, 1, "the next one was not triggered"),
         ("software", 3, 3, "all 3 frames of the series were read"),
-        ("internal", 0, 1, "frame 1 is not ready, which needs no trigger"),
+        ("internal", 0, 1, "frame 1 needs no trigger, but is not ready"),
         ("external", 0, 0, "frame 0 waits for its external trigger, the line 'exposure'; check the cable"),
     ],
 )

@@ -133,7 +133,7 @@ def test_values_are_for_sequences_that_allow_them(tmp_path: Path) -> None:
     assert said[4] == "busy"
     assert said[5].startswith("failed refused=1 reason=this is not JSON")
     assert said[6].startswith('error expected {"go": TEXT')
-    assert said[7] == "error 'done' answers nothing that labseq has asked for"
+    assert said[7] == "error labseq has not asked for 'done'"
 
 
 @pytest.mark.parametrize(

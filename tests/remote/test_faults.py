@@ -325,7 +325,7 @@ def test_errors_keep_their_class_and_values(server: Served) -> None:
     ("settings", "match"),
     [
         ({"device": "laser_7"}, "no device 'laser_7'; expected one of"),
-        ({"device": "camera"}, "is of the kind camera, and the profile uses it as device"),
+        ({"device": "camera"}, "is of the kind camera, but the profile uses it as device"),
     ],
 )
 def test_a_wrong_name_is_refused(server: Served, settings: dict[str, str], match: str) -> None:

@@ -133,7 +133,7 @@ class CameraContract(HardwareContract[Camera]):
             text = f"the frame's exposure is {frame.exposure_s:g} s; expected {self.exposure_s:g} s"
             assert deviation <= self.exposure_tolerance, text
 
-    @promise("after arm(n) come n frames, the oldest first, and no more")
+    @promise("arm(n) gives n frames, the oldest first, and no more")
     def test_gives_as_many_frames_as_armed_for(self, factory: Factory[Camera]) -> None:
         """And the next series starts from the beginning."""
         with self.opened(factory) as (camera, _):

@@ -73,13 +73,13 @@ class DetectorContract:
             _require_array(f"on {what} the occupancy", occupancy, np.bool_, context.grid.shape)
             _require_array(f"on {what} the confidence", confidence, np.float32, context.grid.shape)
             assert np.all((confidence >= 0) & (confidence <= 1)), (
-                f"on {what} the confidence reaches from {confidence.min()} to {confidence.max()}"
+                f"on {what} the confidence ranges from {confidence.min()} to {confidence.max()}"
             )
             if signals:
                 _require_array(f"on {what} the signals", signals[0], np.float64, context.grid.shape)
             if signals and isinstance(detector, ReportsSignals):
                 decided = signals[0] > detector.thresholds
-                assert np.array_equal(occupancy, decided), f"on {what} the signals decide otherwise"
+                assert np.array_equal(occupancy, decided), f"on {what} the signals contradict the occupancy"
 
     @promise("the same frame gives the same answer")
     def test_same_frame_same_answer(self, factory: DetectorFactory) -> None:
@@ -97,7 +97,7 @@ class DetectorContract:
         again["from a new instance"] = answer_of(factory(self.context()))
         for when, answer in again.items():
             for name, was, now in zip(("occupancy", "confidence", "signals"), first, answer, strict=False):
-                assert np.array_equal(was, now), f"the {name} is another {when}"
+                assert np.array_equal(was, now), f"the {name} differs {when}"
 
     @promise("an answer does not change after it was given")
     def test_answers_do_not_change(self, factory: DetectorFactory) -> None:
@@ -342,7 +342,7 @@ class AnalysisContract:
             for name, array in _arrays(shot).items():
                 assert np.array_equal(before[name], array), f"of {what} it changed {name}"
 
-    @promise("a shot that lacks something gives a result, or raises LabseqError")
+    @promise("an incomplete shot gives a result, or raises LabseqError")
     def test_takes_odd_shots(self, factory: AnalysisFactory) -> None:
         """Without images, without frames, without atoms."""
         analysis = factory(self.context())

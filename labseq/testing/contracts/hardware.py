@@ -56,7 +56,7 @@ USE_THE_CLOCK: Final = (
     "due, then labseq.plugin.wait_for if the device may be late. In tests and rehearsals the clock is "
     "virtual, and time.sleep or a blocking read of a library does not move it"
 )
-ALWAYS_SAFE: Final = "safe_state() is legal in every state, and twice"
+ALWAYS_SAFE: Final = "safe_state() is legal in every state, also twice"
 
 
 class HardwareContract(Generic[D]):
@@ -324,7 +324,7 @@ class HardwareContract(Generic[D]):
                 refusal(DeviceError, f"{what} after close()", use, device)
 
     @promise(
-        "what exceeds a limit is refused with LimitError before anything moves",
+        "a call beyond a limit is refused with LimitError before anything moves",
         "check the arguments first, all in SI units, and raise LimitError(what, value, limit)",
     )
     def test_refuses_what_exceeds_limits(self, factory: Factory[D]) -> None:

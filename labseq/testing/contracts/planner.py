@@ -72,7 +72,7 @@ class PatternContract:
             again = _target_of(factory, grid)
             for name in ("fill", "clear"):
                 same = np.array_equal(getattr(target, name), getattr(again, name))
-                assert same, f"on {_called(grid)} {name} is another the second time"
+                assert same, f"on {_called(grid)} {name} differs the second time"
             assert target.name == again.name, f"it is called '{target.name}', then '{again.name}'"
 
     @promise("a grid that is too small for it raises LabseqError")
@@ -385,7 +385,7 @@ class PlannerContract:
             again["after another input"] = plan_of(planner, same(target), atoms.copy())
             again["from a new instance"] = self.planned(factory, same(target), atoms.copy())
             for when, plan in again.items():
-                assert first.is_same(plan), f"the plan is another {when}"
+                assert first.is_same(plan), f"the plan differs {when}"
 
     @promise("the input is left untouched", f"{_COPY}, and change only a copy of it: occupancy.copy()")
     def test_leaves_the_input_untouched(self, factory: PlannerFactory) -> None:
