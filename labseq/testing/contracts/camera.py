@@ -62,7 +62,7 @@ class CameraContract(HardwareContract[Camera]):
         }
 
     def states(self) -> Mapping[str, Action[Camera]]:
-        """Armed, exposing, and with a frame that has not been read."""
+        """States of an armed camera, while exposing, and with an unread frame."""
 
         def expose(camera: Camera) -> None:
             camera.arm(2, self.exposure_s, "software")
@@ -135,7 +135,7 @@ class CameraContract(HardwareContract[Camera]):
 
     @promise("arm(n) gives n frames, the oldest first, and no more")
     def test_gives_as_many_frames_as_armed_for(self, factory: Factory[Camera]) -> None:
-        """And the next series starts from the beginning."""
+        """Take fewer and more frames than armed for. The next series starts from the beginning."""
         with self.opened(factory) as (camera, _):
             shapes = {np.shape(frame.image) for frame in self.take(camera, 3)}
             assert len(shapes) == 1, f"the frames of a series have the shapes {sorted(shapes)}"
@@ -175,7 +175,7 @@ class CameraContract(HardwareContract[Camera]):
 
     @promise("with the internal trigger the frames of a series come without trigger()")
     def test_exposes_by_itself(self, factory: Factory[Camera]) -> None:
-        """For a camera with the internal trigger."""
+        """Take a series with the internal trigger, if the camera has it."""
         with self.opened(factory) as (camera, _):
             if "internal" not in camera.facts.triggers:
                 return
@@ -219,7 +219,7 @@ class CameraContract(HardwareContract[Camera]):
 
     @promise("trigger() without arm() raises DeviceError")
     def test_refuses_trigger_without_arm(self, factory: Factory[Camera]) -> None:
-        """Also after safe_state() and, if the driver has its own, disarm(), which end the series."""
+        """Trigger after open(), safe_state() and, if the driver has its own, disarm()."""
         with self.opened(factory) as (camera, _):
             refusal(DeviceError, "trigger() after open()", camera.trigger)
             for name in [*(["disarm"] if overrides(camera, Camera.disarm) else []), "safe_state"]:
@@ -233,7 +233,7 @@ class CameraContract(HardwareContract[Camera]):
         "let safe_state() end the acquisition",
     )
     def test_ignores_edges_after_safe_state(self, factory: Factory[Camera]) -> None:
-        """For a camera with the external trigger."""
+        """Send edges to a camera with the external trigger."""
         with self.wired(factory, "image") as (camera, context, pulse):
             if camera is None or "external" not in camera.facts.triggers:
                 return

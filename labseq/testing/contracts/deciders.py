@@ -63,7 +63,7 @@ class DetectorContract:
         "detect() gives bool (n_rows, n_cols), float32 (n_rows, n_cols) from 0 to 1, and perhaps signals"
     )
     def test_gives_occupancy_and_confidence(self, factory: DetectorFactory) -> None:
-        """On frames of every kind."""
+        """Detect atoms on frames of every kind."""
         context = self.context()
         detector = factory(context)
         for what, frame in self.frames().items():
@@ -83,7 +83,7 @@ class DetectorContract:
 
     @promise("the same frame gives the same answer")
     def test_same_frame_same_answer(self, factory: DetectorFactory) -> None:
-        """Again, after other frames, and from a new instance."""
+        """Repeat a frame, also after other frames and with a new instance."""
         detector = factory(self.context())
 
         def answer_of(any_detector: Detector) -> Detection:
@@ -122,7 +122,7 @@ class DetectorContract:
 
     @promise("a frame of the wrong size raises LabseqError")
     def test_refuses_other_sizes(self, factory: DetectorFactory) -> None:
-        """Smaller, larger, turned."""
+        """Pass frames that are smaller, larger or turned."""
         height, width = self.frame_shape
         detector = factory(self.context())
         for shape in {(height - 1, width), (height, width + 1), (2 * height, 2 * width), (1, 1)}:
@@ -185,7 +185,7 @@ class ScannerContract:
 
     @promise(GIVES_POINTS)
     def test_points_are_in_their_ranges(self, factory: ScannerFactory) -> None:
-        """With scores that rise, stay the same or are missing."""
+        """Choose points with scores that rise, stay the same or are missing."""
         for what, space in self.spaces().items():
             for kind, scores in _SCORES.items():
                 with doing(f"on {what}, {kind}"):
@@ -193,7 +193,7 @@ class ScannerContract:
 
     @promise("the same space and the same results give the same point")
     def test_same_results_same_point(self, factory: ScannerFactory) -> None:
-        """Again, and from a new instance that receives all results at once, as in a resumed run."""
+        """Repeat, also with a new instance that receives all results at once, as in a resumed run."""
         for what, space in self.spaces().items():
             scanner = factory(space)
             visited = self.visited(scanner, space, _hill)
@@ -215,7 +215,7 @@ class ScannerContract:
 
     @promise("it is pure: no I/O, no change of shared state")
     def test_is_pure(self, factory: ScannerFactory) -> None:
-        """Its choice could otherwise depend on something that a resumed run does not have."""
+        """Watch for I/O and shared state, which a resumed run does not have."""
         space = self.spaces()["all kinds of range"]
         visited = self.visited(factory(space), space, _hill)  # the first call may compile
         with quietly():
@@ -314,7 +314,7 @@ class AnalysisContract:
 
     @promise(GIVES_RESULTS)
     def test_gives_results(self, factory: AnalysisFactory) -> None:
-        """They are written as a line of JSON, so "shot" and "error" cannot be names of results."""
+        """Check names and values. Results become a line of JSON, which already has "shot" and "error"."""
         analysis = factory(self.context())
         for what, shot in self.shots().items():
             with doing(what):
@@ -344,7 +344,7 @@ class AnalysisContract:
 
     @promise("an incomplete shot gives a result, or raises LabseqError")
     def test_takes_odd_shots(self, factory: AnalysisFactory) -> None:
-        """Without images, without frames, without atoms."""
+        """Analyse shots without images, without frames and without atoms."""
         analysis = factory(self.context())
         for what, shot in self.odd_shots().items():
             with doing(what):

@@ -204,7 +204,7 @@ class HardwareContract(Generic[D]):
 
     @promise(WORKS)
     def test_works(self, factory: Factory[D]) -> None:
-        """Nothing else can be tested without it."""
+        """Do the role's work once. Nothing else can be tested without it."""
         try:
             close_quietly(factory(self.context()))
         except TypeError as error:
@@ -303,7 +303,7 @@ class HardwareContract(Generic[D]):
         "give a dict of text, bool, int, float, None and lists of them, with float(...) for numbers of numpy",
     )
     def test_describes_itself(self, factory: Factory[D]) -> None:
-        """It is written into every run."""
+        """Check the description, which is written into every run."""
         with self.opened(factory) as (device, _):
             described: Any = device.describe()
             assert isinstance(described, Mapping), f"it gave a {type(described).__name__}"
@@ -314,7 +314,7 @@ class HardwareContract(Generic[D]):
         "begin each of them with: if not open, raise DeviceError(context.name, 'it is not open')",
     )
     def test_refuses_calls_while_closed(self, factory: Factory[D]) -> None:
-        """Every call of the role that needs the device."""
+        """Make every call of the role that needs an open device."""
         for what, use in self.uses().items():
             with self.made(factory) as (device, _):
                 refusal(DeviceError, f"{what} before open()", use, device)
@@ -345,7 +345,7 @@ class HardwareContract(Generic[D]):
         "DeviceTimeoutError(context.name, ...)",
     )
     def test_keeps_timeouts(self, factory: Factory[D]) -> None:
-        """On the virtual clock, so that it costs no time."""
+        """Wait on the virtual clock, so that it costs no time."""
         for what, wait in self.waits().items():
             with self.opened(factory) as (device, context):
                 wait.enter(device)
@@ -361,7 +361,7 @@ class HardwareContract(Generic[D]):
         "raise DeviceError(context.name, ...), with the name that the constructor received",
     )
     def test_errors_name_the_device(self, factory: Factory[D]) -> None:
-        """So that the message shows which instrument failed."""
+        """Check the name in each error, so that the message shows which instrument failed."""
         for what, use in self.uses().items():
             with self.made(factory) as (device, context):
                 self._named(context, what, use, device)

@@ -33,17 +33,17 @@ class DeviceContract(HardwareContract[Device]):
     values: ClassVar[Sequence[str]] = ()
 
     def work(self, device: Device) -> None:
-        """Every command."""
+        """Carry out every command."""
         for name, arguments in self.commands.items():
             device.command(name, **arguments)
 
     def uses(self) -> Mapping[str, Action[Device]]:
-        """Every command and every value."""
+        """Send every command and read every value."""
         commands = {f"command('{name}')": self._command(name, given) for name, given in self.commands.items()}
         return {**commands, **{f"read('{name}')": _read(name) for name in self.values}}
 
     def states(self) -> Mapping[str, Action[Device]]:
-        """After each command."""
+        """States after each command."""
         return {f"after '{name}'": self._command(name, given) for name, given in self.commands.items()}
 
     def excesses(self) -> Mapping[str, Action[Device]]:
@@ -52,7 +52,7 @@ class DeviceContract(HardwareContract[Device]):
 
     @promise("every command and value that the device declares works")
     def test_does_what_it_declares(self, factory: Factory[Device]) -> None:
-        """In the order in which the test lists them."""
+        """Use commands and values in the order in which the test lists them."""
         with self.opened(factory) as (device, _):
             for name, arguments in self.commands.items():
                 with doing(f"command('{name}')"):
@@ -71,7 +71,7 @@ class DeviceContract(HardwareContract[Device]):
 
     @promise("an unknown value raises a DeviceError that names the known ones")
     def test_refuses_unknown_values(self, factory: Factory[Device]) -> None:
-        """As with commands."""
+        """A user who mistypes a value sees the known ones."""
         with self.opened(factory) as (device, _):
             error = refusal(DeviceError, "an unknown value", device.read, "no_such_value")
             missing = [name for name in self.values if name not in str(error)]
@@ -115,7 +115,7 @@ class LinesContract(HardwareContract[Lines]):
         return line_program(self.specs, kind, duration_s)
 
     def ready(self, device: Lines) -> None:
-        """Compile and arm a program, so that it can be fired."""
+        """Compile a program, so that it can be armed and fired."""
         device.compile(self.program())
 
     def work(self, device: Lines) -> None:
@@ -135,7 +135,7 @@ class LinesContract(HardwareContract[Lines]):
         }
 
     def states(self) -> Mapping[str, Action[Lines]]:
-        """Compiled, armed, and in the middle of a program."""
+        """States with a compiled program, armed, and in the middle of a program."""
 
         def arm(lines: Lines) -> None:
             lines.compile(self.program("load", 50e-3))
@@ -189,7 +189,7 @@ class LinesContract(HardwareContract[Lines]):
 
     @promise("fire() returns at once, and wait() returns at the end of the program")
     def test_waits_for_the_end(self, factory: Factory[Lines]) -> None:
-        """So that the next step begins after the lags."""
+        """Time both calls, because the next step must begin after the lags."""
         with self.opened(factory) as (lines, context):
             program = self.program("load", 30e-3)
             lines.compile(program)
@@ -203,7 +203,7 @@ class LinesContract(HardwareContract[Lines]):
 
     @promise("each fire() needs its own arm()")
     def test_refuses_fire_without_arm(self, factory: Factory[Lines]) -> None:
-        """So that nothing is fired twice by mistake."""
+        """Fire without arming, so that nothing is fired twice by mistake."""
         with self.opened(factory) as (lines, _):
             refusal(DeviceError, "arm() before compile()", lines.arm)
             lines.compile(self.program())
@@ -216,7 +216,7 @@ class LinesContract(HardwareContract[Lines]):
         "let safe_state() forget the program, so that only compile() makes the next one possible",
     )
     def test_drops_its_program(self, factory: Factory[Lines]) -> None:
-        """In every state."""
+        """Fire and arm after safe_state() in every state."""
         with self.each_state(factory) as states:
             for state, lines, _ in states:
                 lines.safe_state()

@@ -54,7 +54,7 @@ class PatternContract:
 
     @promise(FITS)
     def test_fits_the_grid(self, factory: PatternFactory) -> None:
-        """On each of ``grids``."""
+        """Make the target on each of ``grids``."""
         for grid in self.grids:
             _target_of(factory, grid)
 
@@ -66,7 +66,7 @@ class PatternContract:
 
     @promise("the same grid gives the same target")
     def test_same_grid_same_target(self, factory: PatternFactory) -> None:
-        """Again, and after other grids, because a resumed run fills the same target."""
+        """Repeat, also after other grids, because a resumed run fills the same target."""
         first = [_target_of(factory, grid) for grid in self.grids]
         for grid, target in zip(self.grids, first, strict=True):
             again = _target_of(factory, grid)
@@ -312,7 +312,7 @@ class PlannerContract:
 
     @promise(RETURNS_A_PLAN)
     def test_returns_a_plan(self, factory: PlannerFactory) -> None:
-        """Not a list or None, for single sites and lines, empty and full loadings, and full size."""
+        """Plan for single sites and lines, empty and full loadings, and full size."""
         for case in self.extreme_cases():
             self.checked(factory, *case)
         for target, atoms in self.large_cases():
@@ -320,7 +320,7 @@ class PlannerContract:
 
     @promise(NO_ATOM_CREATED)
     def test_creates_no_atom(self, factory: PlannerFactory) -> None:
-        """Random small arrays, on any target."""
+        """Plan for random small arrays and any target."""
 
         def check(target: TargetPattern, atoms: Occupancy) -> None:
             plan = self.answered(self.made(factory, self.context(target.shape)), target, atoms)
@@ -331,7 +331,7 @@ class PlannerContract:
 
     @promise(PASSES_THE_CHECK)
     def test_plans_are_legal(self, factory: PlannerFactory) -> None:
-        """Small random arrays with any number of atoms, and one of full size."""
+        """Plan for small random arrays with any number of atoms, and one of full size."""
 
         def check(target: TargetPattern, atoms: Occupancy) -> None:
             self.checked(factory, target, atoms)
@@ -345,7 +345,7 @@ class PlannerContract:
         "if it fills only certain targets, set fills_any_target = False and list some of them in targets",
     )
     def test_fills_the_target(self, factory: PlannerFactory) -> None:
-        """Random small arrays with enough atoms, and one of full size."""
+        """Plan for random small arrays with enough atoms, and one of full size."""
 
         def check(target: TargetPattern, atoms: Occupancy) -> None:
             report = self.checked(factory, target, atoms)
@@ -360,7 +360,7 @@ class PlannerContract:
 
     @promise("with too few atoms the plan leaves no more defects than it found")
     def test_does_what_it_can_with_too_few_atoms(self, factory: PlannerFactory) -> None:
-        """Random small arrays."""
+        """Plan for random small arrays."""
 
         def check(target: TargetPattern, atoms: Occupancy) -> None:
             report = self.checked(factory, target, atoms)
@@ -376,7 +376,7 @@ class PlannerContract:
         "keep nothing between calls, and do not use the order of a set or random numbers",
     )
     def test_same_input_same_plan(self, factory: PlannerFactory) -> None:
-        """Again, after other calls, and from a new instance."""
+        """Repeat, also after other calls and with a new instance."""
         for target, atoms in self.large_cases():
             planner = self.made(factory, self.context(target.shape))
             first = plan_of(planner, same(target), atoms.copy())
@@ -389,7 +389,7 @@ class PlannerContract:
 
     @promise("the input is left untouched", f"{_COPY}, and change only a copy of it: occupancy.copy()")
     def test_leaves_the_input_untouched(self, factory: PlannerFactory) -> None:
-        """The occupancy belongs to the shot's record."""
+        """Compare occupancy and target before and after. The occupancy belongs to the shot's record."""
         for target, atoms in self.large_cases():
             given_atoms = atoms.copy()
             fill, clear = target.fill.copy(), target.clear.copy()
@@ -418,7 +418,7 @@ class PlannerContract:
         "an array that is not an occupancy of the target's shape raises LabseqError or ValueError", _COPY
     )
     def test_refuses_wrong_input(self, factory: PlannerFactory) -> None:
-        """Neither a wrong plan nor an error from deep inside."""
+        """Pass wrong arrays, which must give neither a plan nor an obscure error."""
         target, atoms = self.large_cases()[0]
         planner = self.made(factory, self.context(target.shape))
         plan_of(planner, target, atoms.copy())
@@ -438,7 +438,7 @@ class PlannerContract:
         "write the loops as kernels (labseq.plugin.kernel), or raise time_limit_s and timeouts.plan",
     )
     def test_plans_in_time(self, factory: PlannerFactory) -> None:
-        """The best of three, after compiling."""
+        """Time plans of full size after compiling. The best of three counts."""
         for target, atoms in self.large_cases():
             planner = self.ready(factory, target)
             taken_s: list[float] = []

@@ -103,7 +103,7 @@ class SimulationContract:
 
     @promise("expose() gives a Frame: uint16 (height, width), with the requested exposure and start")
     def test_gives_frames(self, factory: Factory) -> None:
-        """All of the same shape. A frame does not change when the next one is taken."""
+        """Take frames of the same shape. A frame does not change when the next one is taken."""
         with self.opened(factory) as (simulation, context):
             frames: list[Any] = [*self.shot(simulation, context, 0)]
             copies = [np.array(getattr(frame, "image", 0)) for frame in frames]
@@ -127,7 +127,7 @@ class SimulationContract:
 
     @promise(SAME_SEED)
     def test_same_seed_same_frames(self, factory: Factory) -> None:
-        """So that a run can be repeated."""
+        """Compare simulations with equal and different seeds, so that a run can be repeated."""
         frames = {
             name: self._shots(factory, (0, 1), seed) for name, seed in (("1", 1), ("again", 1), ("2", 2))
         }
@@ -136,7 +136,7 @@ class SimulationContract:
 
     @promise("a shot does not depend on earlier shots")
     def test_shots_are_independent(self, factory: Factory) -> None:
-        """So that a resumed run gives the same data. No atom outlives a shot."""
+        """Take a shot with and without earlier ones. A resumed run gives the same data."""
         after_others = self._shots(factory, (0, 1, 2), 1)[-2:]
         alone = self._shots(factory, (2,), 1)
         with promised(SAME_SEED):
@@ -145,7 +145,7 @@ class SimulationContract:
 
     @promise("atoms are loaded where static tweezers are on, and begin_shot() removes them")
     def test_loads_atoms(self, factory: Factory) -> None:
-        """For a simulation that reports the true occupancy."""
+        """Load atoms, if the simulation reports the true occupancy."""
         with self.opened(factory) as (simulation, context):
             if simulation.truth() is None:
                 return
@@ -167,7 +167,7 @@ class SimulationContract:
 
     @promise("an exposure that is not longer than 0 is refused with LimitError")
     def test_refuses_impossible_exposures(self, factory: Factory) -> None:
-        """And the next shot works."""
+        """Try wrong exposures, after each of which the next shot works."""
         with self.opened(factory) as (simulation, context):
             self.shot(simulation, context, 0)
             for exposure_s in (0.0, -1.0, float("nan")):

@@ -63,7 +63,7 @@ class StepContract:
 
     @promise(RUNS, "write it as 'def run(self, shot)', with durations in seconds and lengths in metres")
     def test_runs(self, factory: Factory) -> None:
-        """Nothing else can be tested without it."""
+        """Run the step once. Nothing else can be tested without it."""
         step = factory()
         with self.shot() as (shot, _):
             step.run(shot)
@@ -113,7 +113,7 @@ class StepContract:
 
     @promise("a `repeatable` step leaves the atoms alone, and can run again in the same shot")
     def test_runs_again(self, factory: Factory) -> None:
-        """So that a failed attempt can be repeated. By default a step is not repeatable."""
+        """Run a repeatable step twice, as after a failure. By default a step is not repeatable."""
         step = factory()
         repeatable: Any = step.repeatable
         assert isinstance(repeatable, bool), f"repeatable is {repeatable!r}"
@@ -132,7 +132,7 @@ class StepContract:
         "wait with shot.clock.sleep and call devices with shot.call (time.sleep ignores a stop request)",
     )
     def test_hears_a_stop_request(self, factory: Factory) -> None:
-        """It waits and calls devices through the shot, which checks for stop requests."""
+        """Ask it to stop. It waits and calls devices through the shot, which checks for stop requests."""
         step = factory()
         with self.shot() as (shot, lab):
             lab.stop.request()

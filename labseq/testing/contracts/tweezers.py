@@ -53,7 +53,7 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
         }
 
     def states(self) -> Mapping[str, Action[StaticTweezers]]:
-        """Loaded, on, lowered."""
+        """States with amplitudes loaded, on, and lowered."""
 
         def lower(tweezers: StaticTweezers) -> None:
             tweezers.start()
@@ -86,7 +86,7 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
 
     @promise("start() turns the array on, and does nothing if it is on")
     def test_starts_twice(self, factory: Factory[StaticTweezers]) -> None:
-        """Every shot starts it."""
+        """Start the array twice, because every shot starts it."""
         with self.opened(factory) as (tweezers, context):
             tweezers.start()
             before = n_calls(context)
@@ -96,7 +96,7 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
 
     @promise("start() brings the array back to its nominal depth after a ramp")
     def test_starts_after_a_ramp(self, factory: Factory[StaticTweezers]) -> None:
-        """Each shot begins at full depth, whatever happened in the last one."""
+        """Start after a ramp, because each shot begins at full depth."""
         with self.opened(factory) as (tweezers, context):
             tweezers.start()
             if not tweezers.facts.ramps:
@@ -111,7 +111,7 @@ class StaticTweezersContract(HardwareContract[StaticTweezers]):
 
     @promise("ramp() takes every depth from 0 to 1 (or only 0 and 1 if `facts` say so), and a duration of 0")
     def test_ramps(self, factory: Factory[StaticTweezers]) -> None:
-        """Down to 0 and back."""
+        """Ramp down to 0 and back."""
         with self.opened(factory) as (tweezers, _):
             tweezers.start()
             if not tweezers.facts.ramps:
@@ -228,7 +228,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
         }
 
     def states(self) -> Mapping[str, Action[MobileTweezers]]:
-        """Prepared, playing, played."""
+        """States with a program prepared, playing, and played."""
         return {
             "while prepared": lambda tweezers: tweezers.prepare(self.program()),
             "while playing": self.begin,
@@ -288,7 +288,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
 
     @promise("prepare, play, wait can be repeated")
     def test_plays_programs(self, factory: Factory[MobileTweezers]) -> None:
-        """One program per cycle."""
+        """Play a program several times, as in each cycle."""
         with self.opened(factory) as (tweezers, _):
             for count in ("first", "second", "third"):
                 with doing(f"the {count} program"):
@@ -306,7 +306,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
 
     @promise("play() without prepare() raises DeviceError")
     def test_refuses_play_without_prepare(self, factory: Factory[MobileTweezers]) -> None:
-        """So that no program of an earlier shot is played by mistake."""
+        """Play without preparing, so that no program of an earlier shot is played by mistake."""
         with self.opened(factory) as (tweezers, _):
             refusal(DeviceError, "play() after open()", tweezers.play)
 
@@ -315,7 +315,7 @@ class MobileTweezersContract(HardwareContract[MobileTweezers]):
         "let safe_state() drop the prepared program, and disarm everything that waits for its trigger",
     )
     def test_drops_its_program(self, factory: Factory[MobileTweezers]) -> None:
-        """In every state. Then with a trigger, for tweezers that a line can start."""
+        """Play after safe_state() in every state, and by a trigger if a line can start the tweezers."""
         with self.each_state(factory) as states:
             for state, tweezers, _ in states:
                 tweezers.safe_state()

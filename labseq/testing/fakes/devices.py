@@ -52,7 +52,7 @@ class Call(NamedTuple):
 
     @property
     def name(self) -> str:
-        """For example "camera.arm"."""
+        """Name of the call, such as "camera.arm"."""
         return f"{self.device}.{self.method}"
 
     def __str__(self) -> str:
