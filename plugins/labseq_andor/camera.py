@@ -94,7 +94,7 @@ class AndorCamera(SdkCamera):
 
     @property
     def facts(self) -> CameraFacts:
-        """Limits of the camera; the read-out time is an estimate before ``open()``, then the SDK's value."""
+        """Limits of the camera. The read-out time is an estimate before ``open()``, then the SDK's value."""
         shape = self._settings.frame_shape(self._sensor_shape)
         known = {"max_exposure_s": self._max_exposure_s, "em_gain": float(self._settings.em_gain)}
         return self._settings.facts(self._readout_s, shape, self._triggers, **known)
@@ -104,7 +104,7 @@ class AndorCamera(SdkCamera):
         self.connection.warm(self.facts.em_gain)
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
-        """Those of the SDK and the camera; no real camera was tried."""
+        """Versions of the SDK and the camera. No real camera was tried."""
         reported = self._reported
         return {
             "SDK2": (reported.get("sdk_version", ""), ""),
@@ -112,7 +112,7 @@ class AndorCamera(SdkCamera):
         }
 
     def describe(self) -> Mapping[str, Any]:
-        """Settings; once opened, also what the camera reports, and its current state."""
+        """Settings, and once opened also the camera's own report and its current state."""
         described = {"model": "Andor EMCCD", **self._settings.model_dump(mode="json"), **self._reported}
         described |= {"readout_s": self._readout_s, "frame_shape": self.facts.frame_shape}
         if self.connection.is_open:
@@ -141,7 +141,7 @@ class AndorCamera(SdkCamera):
         self._open_shutter()
 
     def _find_triggers(self) -> tuple[str, ...]:
-        """The triggers that the camera has; with frame transfer, bulb has capabilities of its own."""
+        """The triggers that the camera has. Bulb with frame transfer has capabilities of its own."""
         capabilities = self.connection.capabilities
         triggers = [name for name, (_, flag) in TRIGGERS.items() if capabilities.ulTriggerModes & flag]
         lacks_both = capabilities.ulFeatures & BULB_AND_TRANSFER != BULB_AND_TRANSFER
@@ -200,7 +200,7 @@ class AndorCamera(SdkCamera):
         self._n_fetched = 0
 
     def _set_series(self, sdk: AndorSdk, series: Series) -> float:
-        """Set trigger and times, unless they are set already; returns the exposure that the camera makes."""
+        """Set trigger and times, unless they are set already. Returns the exposure that the camera makes."""
         n_frames = 0 if series.trigger == "software" else series.n_frames
         wanted = series.trigger, n_frames, series.exposure_s
         if wanted == self._set_for:
@@ -230,7 +230,7 @@ class AndorCamera(SdkCamera):
             self._em_gain = gain
 
     def _open_shutter(self) -> None:
-        """Start to open the shutter; no effect if it is open, or the camera controls none."""
+        """Start to open the shutter. No effect if it is open, or the camera controls none."""
         if self._shutter == "closed":
             is_auto = self._settings.shutter == "auto"
             with self.connection.selected() as sdk:
@@ -250,7 +250,7 @@ class AndorCamera(SdkCamera):
         except DeviceError as error:
             if code_of(error) != Code.ERROR_CODES:
                 raise
-            text = "the camera cannot take a trigger yet: it still reads the last frame; read that first"
+            text = "the camera cannot take a trigger while it reads a frame; fetch the last frame first"
             raise DeviceError(self._name, f"{text}, or set `frame_transfer: true`") from error
 
     def _take(self, timeout_s: float) -> ExposureResult | None:
@@ -259,7 +259,7 @@ class AndorCamera(SdkCamera):
         return self.connection.wait(self._look, timeout_s)
 
     def _look(self, wait_s: float) -> ExposureResult | None:
-        """Fetch the oldest frame; wait for it for at most ``wait_s`` seconds."""
+        """Fetch the oldest frame, and wait for it for at most ``wait_s`` seconds."""
         number = self._oldest_number()
         if number is None and (fault := self._fault()):
             self._n_fetched = (self._n_fetched or 0) + 1
@@ -280,7 +280,7 @@ class AndorCamera(SdkCamera):
         return first
 
     def _fault(self) -> str:
-        """Why no further frame will come; empty if no reason is known."""
+        """Why no further frame will come, empty if no reason is known."""
         with self.connection.selected() as sdk:
             status = sdk.GetStatus()
         if status in GONE:
@@ -302,7 +302,7 @@ class AndorCamera(SdkCamera):
         return ExposureResult(number - 1, image, exposure_s=self._exposure_s, device_time_s=time_s)
 
     def _end(self) -> None:
-        """Abort, gain off; the shutter stays open."""
+        """Abort and turn the gain off. The shutter stays open."""
         self._attempt(_abort, self._turn_gain_off)
 
     def _stop(self) -> None:

@@ -1,4 +1,4 @@
-"""Numbers of Andor's SDK2, with their names in its header ``atmcd32d.h``, and what return codes mean."""
+"""Numbers of Andor's SDK2, with their names in its header ``atmcd32d.h``, and meanings of return codes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class AcqModes(IntFlag):
 
 
 class TriggerModes(IntFlag):
-    """Triggers that a camera has (``ulTriggerModes``); CONTINUOUS is the software trigger."""
+    """Triggers that a camera has (``ulTriggerModes``). CONTINUOUS is the software trigger."""
 
     INTERNAL = 1
     EXTERNAL = 2
@@ -55,7 +55,7 @@ class TriggerModes(IntFlag):
 
 
 class SetFunctions(IntFlag):
-    """What can be set (``ulSetFunctions``)."""
+    """Settings that a camera has (``ulSetFunctions``)."""
 
     VREADOUT = 0x01
     HREADOUT = 0x02
@@ -78,7 +78,7 @@ class Features(IntFlag):
 
 
 EM_GAIN_REAL: Final = 8
-"""Flag of ``ulEMGainCapability``: the gain can be set as a factor."""
+"""Flag of ``ulEMGainCapability`` for a gain that can be set as a factor."""
 REAL_GAIN_MODE: Final = 3
 """Mode of ``SetEMGainMode`` in which the gain is a factor."""
 FULL_IMAGE: Final = 4
@@ -90,7 +90,7 @@ INTERNAL, EXTERNAL, EXTERNAL_START, EXTERNAL_EXPOSURE, SOFTWARE = 0, 1, 6, 7, 10
 KINETIC, RUN_TILL_ABORT = 3, 5
 """Modes of ``SetAcquisitionMode``."""
 SDK_VERSION: Final = 0x40000000
-"""What ``GetVersionInfo`` tells."""
+"""Argument of ``GetVersionInfo`` for the SDK's version."""
 
 GONE: Final = frozenset({Code.ERROR_ACK, Code.USBERROR, Code.ERROR_NOCAMERA, Code.NOT_INITIALIZED})
 """Codes of a camera that no longer answers."""
@@ -119,7 +119,7 @@ _MEANINGS: Final[dict[int, str]] = {
 
 
 def explain(function: str, code: int) -> str:
-    """What a return code means for a user, with the function and the code at the end."""
+    """Explain a return code to a user, with the function and the code at the end."""
     name = f", DRV_{Code(code).name}" if code in frozenset(Code) else ""
     meaning = _MEANINGS.get(code, "Andor's SDK refuses")
     return f"{meaning} ({function} gave {code}{name})"

@@ -1,4 +1,4 @@
-"""One camera of the SDK: each call selects it, and each failure is a DeviceError."""
+"""One camera of the SDK. Each call selects it, and each failure is a DeviceError."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ def connection_for(settings: AndorSettings, context: Context) -> AndorConnection
 
 
 class AndorConnection:
-    """A camera through Andor's library; the simulated camera overrides which library that is.
+    """A camera through Andor's library. The simulated camera overrides which library that is.
 
     Attributes:
         name: Name of the camera in the profile.
         settings: Its settings.
         head: Head of the camera if it is known before the camera is opened.
-        sensor_shape: (height, width) of its sensor, likewise.
+        sensor_shape: (height, width) of its sensor, if known before the camera is opened.
         is_open: Whether the camera is open.
-        capabilities: What the open camera can do.
+        capabilities: Capabilities of the open camera.
         serial: Its serial number.
     """
 
@@ -75,7 +75,7 @@ class AndorConnection:
         return load_sdk(self.name, self.settings.sdk)
 
     def open(self) -> None:
-        """Open the camera with the serial number of the settings; 0: the only one."""
+        """Open the camera with the serial number of the settings, the only one for 0."""
         self._sdk, serial, seen = self.load(), self.settings.serial, list[int]()
         with self._translated_errors() as sdk:
             indices = range(sdk.GetAvailableCameras())
@@ -93,8 +93,8 @@ class AndorConnection:
             self.attempt(lambda sdk: sdk.SetCoolerMode(1))  # leave the other camera cold
             self._shut_down()
         numbers = " and ".join(str(number) for number in seen)
-        text = f"the connected camera has the serial number {numbers}; expected {serial}"
-        raise DeviceError(self.name, f"{text}; change `serial`, or connect the other one")
+        text = f"the connected camera has the serial number {numbers}, not {serial}"
+        raise DeviceError(self.name, f"{text}; change `serial`, or connect the other camera")
 
     def _initialize(self, index: int) -> None:
         with self._translated_errors() as sdk, sdk.lock:
@@ -109,7 +109,7 @@ class AndorConnection:
                 sdk.SetFanMode(("full", "low", "off").index(self.settings.fan))
 
     def close(self) -> None:
-        """Release the camera, with the cooler as the settings say; legal in any state."""
+        """Release the camera, with the cooler as the settings say. Legal in any state."""
         if self._handle is not None:
             self.attempt(self._leave_cooler)
         self._shut_down()
@@ -121,7 +121,7 @@ class AndorConnection:
             sdk.CoolerOFF()
 
     def _shut_down(self) -> None:
-        """Release the camera; failures are ignored, since nothing can be done about them."""
+        """Release the camera. Failures are ignored, since nothing can be done about them."""
         sdk, handle, self._handle = self._sdk, self._handle, None
         if sdk is None or handle is None or not sdk.lock.acquire(timeout=MAX_STOP_S):
             return
@@ -149,7 +149,7 @@ class AndorConnection:
         """Run all actions even if some fail, also while another thread hangs in a call.
 
         Returns:
-            The first failure; None if there was none.
+            The first failure, None if there was none.
         """
         first: DeviceError | None = None
         lock = None if self._sdk is None else self._sdk.lock
@@ -168,7 +168,7 @@ class AndorConnection:
         return first
 
     def wait_in_sdk(self, timeout_s: float) -> bool:
-        """Wait for the next frame without blocking other calls; False if none came."""
+        """Wait for the next frame without blocking other calls. False if none came."""
         try:
             with self._translated_errors() as sdk:
                 sdk.WaitForAcquisitionByHandleTimeOut(self._handle, round(timeout_s * 1e3))
@@ -179,7 +179,7 @@ class AndorConnection:
         return True
 
     def wait(self, look: Callable[[float], ExposureResult | None], timeout_s: float) -> ExposureResult | None:
-        """Wait for a frame on the session's clock; None if none came in time."""
+        """Wait for a frame on the session's clock. None if none came in time."""
         return wait_for(look, timeout_s, self._clock)
 
     def time_stamp_s(self, index: int) -> float:
@@ -206,5 +206,5 @@ class AndorConnection:
 
 
 def code_of(error: DeviceError) -> int:
-    """The SDK's return code that caused an error; 0 if there is none."""
+    """The SDK's return code that caused an error, 0 if there is none."""
     return int(getattr(error.__cause__, "code", 0))

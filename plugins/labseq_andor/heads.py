@@ -1,4 +1,4 @@
-"""What is known about some camera heads before they are opened, and how long a read-out takes."""
+"""Facts about some camera heads before they are opened, and how long a read-out takes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ ROW_OVERHEAD_S: Final = 3e-6
 class Head:
     """A camera head.
 
-    The values are typical of cameras of this name. Individual heads differ; once a camera is open, the driver
-    uses what the camera reports.
+    The values are typical of cameras of this name. Individual heads differ. Once a camera is open, the driver
+    uses the camera's report.
 
     Attributes:
         model: Name that the camera reports.
@@ -63,7 +63,7 @@ HEADS: Final = (IXON_897, IXON_888)
 
 
 def known_head(model: str) -> Head | None:
-    """The head with this name, or with a longer or shorter form of it; None if it is not known."""
+    """The head with this name, or with a longer or shorter form of it, None if it is not known."""
     for head in HEADS:
         if model and (model.upper().startswith(head.model) or head.model.startswith(model.upper())):
             return head
@@ -75,9 +75,9 @@ def readout_s(
 ) -> float:
     """Time from the end of an exposure until the last pixel is read, in seconds.
 
-    All rows are shifted under the mask. Then each row of the region is shifted into the register and read;
-    the other rows are discarded. A row is read to its full width, except in isolated crop. The formula is
-    ours: once the camera is open, the SDK reports the true time.
+    All rows are shifted under the mask. Then each row of the region is shifted into the register and read.
+    The other rows are discarded. A row is read to its full width, except in isolated crop. The formula is
+    ours. Once the camera is open, the SDK reports the true time.
 
     Args:
         rate_hz: Pixels per second.

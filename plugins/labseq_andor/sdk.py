@@ -1,4 +1,4 @@
-"""Andor's SDK2, called by ctypes: its functions as methods that return what C writes through pointers."""
+"""Andor's SDK2 by ctypes, with functions as methods that return what C writes through pointers."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from typing import Any, Final
 from labseq.plugin import DeviceError
 from labseq_andor.codes import TEMPERATURE_STATUS, Code, explain
 
-OTHERWISE: Final = "to try things without a camera, set `camera: simulated`"
+OTHERWISE: Final = "To try things without a camera, set `camera: simulated`"
 TEXT_BYTES: Final = 256
 """Size of the buffers for texts."""
 
 
 class Capabilities(ctypes.Structure):
-    """The SDK's structure of what a camera can do; its numbers have 32 bits on every system."""
+    """The SDK's structure of a camera's capabilities. Its numbers have 32 bits on every system."""
 
     _fields_ = tuple(
         (name, ctypes.c_uint32)
@@ -123,11 +123,12 @@ SIGNATURES: Final[dict[str, str]] = {
     "GetImages16": "iipu ii",
     "GetMetaDataInfo": "ppu ",
 }
-"""Types of the functions, by name: letters of what is passed, a space, those of what pointers lead to.
+"""Types of the functions, by name. Letters of the arguments, a space, letters of the results by pointer.
 
-They follow Andor's headers ``atmcd32d.h`` and, for Linux, ``atmcdLXd.h``: ``i`` int or at_32 and ``u``
-unsigned int or at_u32, of 32 bits on every system, ``l`` long, which has 64 bits under 64-bit Linux, ``f``
-float, ``p`` any pointer, ``c`` :class:`Capabilities`, ``s`` text, ``n`` text whose length is passed, too.
+They follow Andor's headers ``atmcd32d.h`` and, for Linux, ``atmcdLXd.h``. The letters are ``i`` int or at_32
+and ``u`` unsigned int or at_u32, of 32 bits on every system, ``l`` long, which has 64 bits under 64-bit
+Linux, ``f`` float, ``p`` any pointer, ``c`` :class:`Capabilities`, ``s`` text, ``n`` text whose length is
+passed, too.
 """
 
 
@@ -144,12 +145,12 @@ class AndorError(Exception):
 
 
 class AndorSdk:
-    """The functions in :data:`SIGNATURES` as methods: ``sdk.GetReadOutTime()`` returns the time.
+    """The functions in :data:`SIGNATURES` as methods. ``sdk.GetReadOutTime()`` returns the time.
 
     Methods return nothing, a value or a tuple of values, and raise :class:`AndorError`.
 
     Args:
-        library: Andor's library, loaded, or the simulated one: its attributes are the C functions.
+        library: Andor's library, loaded, or the simulated one. Its attributes are the C functions.
 
     Attributes:
         lock: Held while a camera is selected and used, since the SDK has one selected camera.
@@ -213,14 +214,14 @@ def load_sdk(name: str, path: str) -> AndorSdk:
 
     Args:
         name: Name of the camera in the profile, for errors.
-        path: The file; empty: search.
+        path: The file, or empty to search.
     """
     try:
         return _loaded(path or _installed())
     except OSError as error:
         which = f"'{path or _installed()}' cannot be loaded ({str(error).splitlines()[0]})"
         what = "install Andor SDK2 or Solis for this system, or give the library's file as `sdk`"
-        raise DeviceError(name, f"Andor's library {which}; {what}; {OTHERWISE}") from error
+        raise DeviceError(name, f"Andor's library {which}; {what}. {OTHERWISE}") from error
 
 
 @lru_cache(maxsize=8)

@@ -1,4 +1,4 @@
-"""What is set once, when a camera is opened: amplifier and speeds, cooler, region, EM gain."""
+"""Settings that are made once, when a camera is opened (amplifier, speeds, cooler, region, EM gain)."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from labseq_andor.sdk import AndorSdk
 from labseq_andor.settings import HIGH_GAIN
 
 NEAR: Final = 0.02
-"""Largest relative difference between a speed and the setting for it: the SDK gives speeds as float32."""
+"""Largest relative difference between a speed and its setting, since the SDK gives speeds as float32."""
 
 
 def set_up(camera: AndorConnection) -> dict[str, Any]:
-    """Set what stays the same in all series, with the shutter closed and without EM gain.
+    """Set everything that stays the same in all series, with the shutter closed and without EM gain.
 
     Returns:
-        What the camera reports about itself: JSON-ready values.
+        The camera's report about itself, as JSON-ready values.
 
     Raises:
         DeviceError: Another model than the settings say, or a setting that the camera does not have.
@@ -41,8 +41,8 @@ def set_up(camera: AndorConnection) -> dict[str, Any]:
     with camera.selected() as sdk:
         model = sdk.GetHeadModel()
         if not model.upper().startswith(settings.model.upper()):
-            text = f"the connected camera is a {model}; expected a model that begins with {settings.model}"
-            raise DeviceError(camera.name, f"{text}; change `model`, or connect the other one")
+            text = f"the connected camera is a {model}, but `model` is {settings.model}"
+            raise DeviceError(camera.name, f"{text}; change `model`, or connect the other camera")
         width, height = sdk.GetDetector()
         if conflict := settings.sensor_conflict((height, width)):
             raise ConfigError(f"{camera.name}: {conflict}")
@@ -124,7 +124,7 @@ def _set_amplifier(sdk: AndorSdk, camera: AndorConnection) -> dict[str, Any]:
 
 
 def _set_shift(sdk: AndorSdk, camera: AndorConnection) -> float:
-    """Choose the time to shift the rows by one; returns it, in seconds."""
+    """Choose the time to shift the rows by one, and return it, in seconds."""
     wanted_s = camera.settings.vertical_shift_speed
     shifts_us = [sdk.GetVSSpeed(index) for index in range(sdk.GetNumberVSSpeeds())]
     index, shift_us = sdk.GetFastestRecommendedVSSpeed()
@@ -152,7 +152,7 @@ def _nearest(values: Sequence[float], wanted: float, setting: str, unit: str, na
 
 
 def _set_cooler(sdk: AndorSdk, camera: AndorConnection) -> float | None:
-    """Start to cool; returns the temperature, in kelvins, None if the cooler is left as it is."""
+    """Start to cool. Returns the temperature in kelvins, None if the cooler is left as it is."""
     cooling, name = camera.settings.cooling, camera.name
     if cooling is None:
         return None
@@ -186,7 +186,7 @@ def _set_options(sdk: AndorSdk, camera: AndorConnection) -> None:
 
 
 def _set_region(sdk: AndorSdk, camera: AndorConnection, sensor_shape: tuple[int, int]) -> None:
-    """Set region and binning; after frame transfer, which isolated crop needs."""
+    """Set region and binning, after frame transfer, which isolated crop needs."""
     settings, functions = camera.settings, camera.capabilities.ulSetFunctions
     binning, (y, x, height, width) = settings.binning, settings.mode.region or (0, 0, *sensor_shape)
     sdk.SetReadMode(FULL_IMAGE)
@@ -203,7 +203,7 @@ def _set_region(sdk: AndorSdk, camera: AndorConnection, sensor_shape: tuple[int,
 
 
 def _set_gain_mode(sdk: AndorSdk, camera: AndorConnection) -> list[int] | None:
-    """Choose the mode in which the EM gain is a factor; None for a camera or an amplifier without it."""
+    """Choose the mode in which the EM gain is a factor. None for a camera or an amplifier without it."""
     settings, name, capabilities = camera.settings, camera.name, camera.capabilities
     if settings.amplifier == "em" and capabilities.ulEMGainCapability & EM_GAIN_REAL:
         sdk.SetEMGainMode(REAL_GAIN_MODE)

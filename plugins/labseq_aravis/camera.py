@@ -90,7 +90,7 @@ def camera_id(name: str | None) -> str:
     if len(matches) == 1:
         return matches[0].address or matches[0].id  # ids need not be unique
     if not found:
-        raise AravisError("no camera answered; expected one that is switched on and reachable", "not found")
+        raise AravisError("no camera answered; check that it is switched on and reachable", "not found")
     listed = "; ".join(str(camera) for camera in found)
     if name is None:
         raise AravisError(f"there are {len(found)} cameras: {listed}; name one of them", "not found")

@@ -35,7 +35,7 @@ OCCUPIED: Final = frozenset({"not controller", "access denied", "busy"})
 
 HINTS: Final = {
     "missing": "to try things without it, use another camera, for example `use: virtual`",
-    "not found": "check its cable, power and network address; to try things without a camera, set "
+    "not found": "check its cable, power and network address. To try things without a camera, set "
     "`camera: simulated`",
 }
 """What to do, by the code of an error."""
@@ -74,7 +74,7 @@ def buffer_note(payload: int, room: int) -> str:
         return ""
     frame, limit = f"{payload / 1024:.0f} KiB", f"net.core.rmem_max is {room / 1024:.0f} KiB"
     command = f"sysctl -w net.core.rmem_max={buffer_size(payload)}"
-    return f"a frame of {frame} may not fit into the buffer of its socket: {limit}; raise it with `{command}`"
+    return f"a frame of {frame} may not fit into its socket's buffer, as {limit}; raise it with `{command}`"
 
 
 def connection_for(settings: GenicamSettings, context: Context) -> AravisConnection:
@@ -96,7 +96,7 @@ def translated_errors(name: str, what: str) -> Generator[None]:
     except AravisError as error:
         text = f"cannot {what}: {error}"
         if error.code in OCCUPIED:
-            text = f"cannot {what}: another program controls it; close that one, or wait until it is gone"
+            text = f"cannot {what}: another program controls it; close that program"
         elif hint := HINTS.get(error.code, ""):
             text = f"{text}; {hint}"
         raise DeviceError(name, text) from error
@@ -208,7 +208,7 @@ class AravisConnection(Connection):
             self._opened().get("Width", int)
 
     def _gone(self) -> DeviceError:
-        return DeviceError(self._name, "the camera is gone: it does not answer; check its cable and power")
+        return DeviceError(self._name, "the camera no longer answers; check its cable and power")
 
     def _opened(self) -> Camera:
         if self.camera is None:

@@ -116,5 +116,5 @@ class Connection(ABC):
         for key, value in wanted.items():
             if value is not None and identity[key] != value:
                 which = f"the camera {identity['serial_number']} ({identity['model']})"
-                text = f"{which} has the {key.replace('_', ' ')} {identity[key]}; expected {value}"
-                raise DeviceError(self._name, f"{text}: name another one as `camera`")
+                text = f"{which} has the {key.replace('_', ' ')} {identity[key]}, not {value}"
+                raise DeviceError(self._name, f"{text}; name another camera as `camera`")

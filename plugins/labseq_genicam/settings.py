@@ -23,26 +23,26 @@ class StandardSettings(CameraSettings):
     """What can be set at every camera with the features of the GenICam standard."""
 
     camera: str | None = Field(
-        default=None, min_length=1, description="which camera; none: the only one that is connected"
+        default=None, min_length=1, description="which camera, or none for the only one connected"
     )
-    model: str | None = Field(default=None, description="model that the camera must be; none: any")
+    model: str | None = Field(default=None, description="model that the camera must be, or none for any")
     pixel_format: PixelFormat | None = Field(
-        default=None, description="bits of a pixel; none: the most that the camera offers"
+        default=None, description="bits of a pixel, or none for the most that the camera offers"
     )
     readout: Duration = Field(
         default=5e-3,
-        description="time from the end of an exposure until its frame can be read, for budgets; the "
-        "simulated camera takes so long",
+        description="time from the end of an exposure until its frame can be read, for budgets. The "
+        "simulated camera takes this long",
     )
     arming_time: Duration = Field(
         default=40e-3,
-        description="time from arming for a series until it can be triggered, for budgets; simulated "
+        description="time from arming for a series until it can be triggered, for budgets. Simulated "
         "cameras take this long",
     )
     frame_rate: Annotated[Frequency, Field(gt=0)] | None = Field(
         default=None,
-        description="exposures per second with the internal trigger, such as `100 Hz`; none: each begins "
-        "when the one before is read out",
+        description="exposures per second with the internal trigger, such as `100 Hz`. With none, each "
+        "begins when the one before is read out",
     )
     trigger_line: str = Field(
         default="Line1", min_length=1, description="input of the external trigger, as the camera calls it"
@@ -54,7 +54,7 @@ class StandardSettings(CameraSettings):
         default=None,
         ge=-100,
         le=1e6,
-        description="analogue gain in the camera's unit, mostly dB; none: as the camera is set",
+        description="analogue gain in the camera's unit, mostly dB, or none to leave the camera's",
     )
     gain_raw: int | None = Field(
         default=None,
@@ -62,12 +62,12 @@ class StandardSettings(CameraSettings):
         description="analogue gain in steps of the camera, for older cameras that have no `gain`",
     )
     packet_size: Annotated[int, Field(ge=220, le=65535)] | None = Field(
-        default=None, description="bytes of a network packet (GigE); none: as the camera is set"
+        default=None, description="bytes of a network packet (GigE), or none to leave the camera's"
     )
     packet_delay: Duration | None = Field(
         default=None,
-        description="pause between two network packets (GigE), for cameras that share a cable; none: as the "
-        "camera is set",
+        description="pause between two network packets (GigE), for cameras on one cable, or none to leave "
+        "the camera's",
     )
 
     @field_validator("camera", "serial", mode="before", check_fields=False)
@@ -109,7 +109,7 @@ class FaultSettings(Settings):
     late_by: Duration = Field(default=0.0, description="delay of each frame")
     unplugged_at: NonNegativeInt | None = Field(
         default=None,
-        description="number, from 0 at opening, of the frame at which it is unplugged; none: never",
+        description="number, from 0 at opening, of the frame at which it is unplugged, or none for never",
     )
     busy: bool = Field(default=False, description="another program controls the camera")
     ignores_triggers: bool = Field(default=False, description="the camera ignores software triggers")
@@ -121,10 +121,10 @@ class GenicamSettings(StandardSettings):
     camera: str | None = Field(
         default=None,
         min_length=1,
-        description="serial number, id or IP address of the camera; none: the only one that is connected; "
-        "`simulated`: a camera on this computer's loopback network that sees the simulated atoms",
+        description="serial number, id or IP address of the camera, or none for the only one connected. "
+        "`simulated` is a camera on this computer's loopback network that sees the simulated atoms",
     )
-    serial: str | None = Field(default=None, description="serial number that the camera must have; none: any")
+    serial: str | None = Field(default=None, description="serial number of the camera, or none for any")
     packet_timeout: PositiveDuration = Field(
         default=20e-3, description="time after which a missing network packet is requested again (GigE)"
     )

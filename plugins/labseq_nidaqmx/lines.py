@@ -39,7 +39,7 @@ HINTS: Final[Mapping[int, str]] = {
     -88705: "look at the cable and the supply of the card",
     -200621: "lower `rate`, or use a card on PCI Express",
     -200016: "lower `rate`, or use a card on PCI Express",
-    -200303: "digital lines of this card need the clock of an analogue output: put a line on one",
+    -200303: "digital lines of this card need the clock of an analogue output, so put a line on one",
 }
 """NI's code -> what to do."""
 
@@ -210,7 +210,7 @@ class NidaqmxLines(Lines):
         if name not in connected:
             expected = one_of(connected) if connected else "a card, but none is connected"
             text = f"NI-DAQmx has no card '{name}'; expected {expected}"
-            raise DeviceError(self._name, f"{text}; NI MAX shows and changes the names of cards")
+            raise DeviceError(self._name, f"{text} (NI MAX shows and changes the names of cards)")
         return ni.system.System.local().devices[name]
 
     def _check_timing(self, ni: Any, group: OutputGroup) -> None:
@@ -225,7 +225,7 @@ class NidaqmxLines(Lines):
         if untimed:
             text = f"{untimed[0]} of this {device.product_type} has no hardware timing"
             hint = "the computer would make its edges milliseconds late; use an output that the card clocks"
-            raise DeviceError(self._name, f"{text}: {hint}")
+            raise DeviceError(self._name, f"{text}, so {hint}")
         fastest_hz = device.ao_max_rate if group.kind == "ao" else device.do_max_rate
         if self._settings.rate > fastest_hz:
             what = f"{self._name}: `rate`, with {group.device}/{group.kind} of this {device.product_type},"

@@ -46,13 +46,13 @@ class NidaqmxSettings(Settings):
     )
     rate: Annotated[Frequency, Field(gt=0)] = Field(
         default=1e6,
-        description="samples per second of all outputs: edges fall on multiples of its inverse. NI-DAQmx "
+        description="samples per second of all outputs. Edges fall on multiples of its inverse. NI-DAQmx "
         "keeps every sample of a step in memory",
     )
     trigger: str = Field(
         default="",
-        description="terminal whose rising edge starts a program that was fired, such as `/Dev1/PFI0`; "
-        "empty: the computer starts it",
+        description="terminal whose rising edge starts a program that was fired, such as `/Dev1/PFI0`. "
+        "If empty, the computer starts it",
     )
     levels: dict[str, LevelSettings] = Field(
         default={}, description="name of each line on an analogue output -> its levels"

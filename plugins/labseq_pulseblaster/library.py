@@ -33,7 +33,7 @@ class InstalledLibrary:
         try:
             return load()
         except SpinapiError as error:
-            hint = "install SpinAPI from spincore.com; to try things without a board, set `driver: simulated`"
+            hint = "install SpinAPI from spincore.com. To try things without a board, set `driver: simulated`"
             raise DeviceError(name, f"{error}; {hint}") from error
 
     def emergency(self, board_number: int, clock_mhz: float, flags: int) -> Emergency | None:

@@ -175,7 +175,7 @@ class PulseBlasterLines(Lines):
             self._clock.sleep(0.8 * TEST_S)
             with self._calls():
                 if self._is_stopped():
-                    text = "a program ended before 80 % of its time, so that the board's clock is faster than"
+                    text = "a program ended before 80 % of its time, so the board's clock is faster than"
                     raise DeviceError(self._name, f"{text} that of the 'model', {self._settings.model}")
         self.wait(TEST_S)
         self._rest(self._resting)
@@ -194,7 +194,7 @@ class PulseBlasterLines(Lines):
             number, n_boards = self._settings.board_number, call(spinapi, "pb_count_boards")
             if number >= n_boards:
                 found = f"boards 0 to {n_boards - 1}" if n_boards else "no board"
-                text = f"there is no board {number}: SpinAPI finds {found}"
+                text = f"there is no board {number}, since SpinAPI finds {found}"
                 raise DeviceError(self._name, f"{text}; look at the cable, or change 'board_number'")
             connect(spinapi, number, self._model.clock_hz / 1e6)
             firmware = call(spinapi, "pb_get_firmware_id")

@@ -188,8 +188,8 @@ class Connection(ABC):
         if not seen:
             raise failures[0]
         numbers = " and ".join(seen)
-        text = f"the connected camera has the serial number {numbers}; expected {wanted}"
-        raise DeviceError(self.name, f"{text}; change `serial`, or connect the other one")
+        text = f"the connected camera has the serial number {numbers}, not {wanted}"
+        raise DeviceError(self.name, f"{text}; change `serial`, or connect the other camera")
 
     def close(self) -> None:
         """Release the camera; failures are ignored, since nothing can be done about them."""
@@ -230,7 +230,7 @@ class Connection(ABC):
                 text = (
                     f"the connected camera is a {model}; expected a model that begins with {settings.model}"
                 )
-                raise DeviceError(self.name, f"{text}; change `model`, or connect the other one")
+                raise DeviceError(self.name, f"{text}; change `model`, or connect the other camera")
             if settings.trigger_edge == "falling" and not self.has_falling_edge:
                 text = f"pylablib sets no falling edge at {settings.interface} cameras"
                 raise DeviceError(self.name, f"{text}; leave `trigger_edge` out")
@@ -274,7 +274,7 @@ class Connection(ABC):
         if made != wanted:
             x0, x1, y0, y1, *bins = made
             text = f"the camera reads y {y0} to {y1}, x {x0} to {x1}, binned by {bins[0]} x {bins[1]}"
-            raise DeviceError(self.name, f"{text}, not what `region` and `binning` say; change them to that")
+            raise DeviceError(self.name, f"{text}, not what `region` and `binning` say; change these")
 
     def _start_cooling(self) -> float | None:
         """Start to cool; returns the set temperature in kelvins, None if the cooler is left as it is."""

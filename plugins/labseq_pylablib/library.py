@@ -17,7 +17,7 @@ from typing import Any, Final
 from labseq.plugin import DeviceError
 from labseq.plugin.messages import install_hint, missing_package
 
-OTHERWISE: Final = "to try things without a camera, use `interface: dcam` with `camera: simulated`"
+OTHERWISE: Final = "To try things without a camera, use `interface: dcam` with `camera: simulated`"
 _loading: Final = Lock()
 
 
@@ -98,7 +98,7 @@ def load(name: str, vendor: Vendor, path: str) -> Any:
         which = path or (vendor.windows if sys.platform == "win32" else vendor.linux)
         text = f"the vendor's library '{which}' cannot be loaded ({_first_line(error)})"
         what = f"install {vendor.source}, or give the library's file as `sdk`"
-        raise DeviceError(name, f"{text}; {what}; {OTHERWISE}") from error
+        raise DeviceError(name, f"{text}; {what}. {OTHERWISE}") from error
 
 
 @lru_cache(maxsize=8)

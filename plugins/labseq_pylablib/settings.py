@@ -27,18 +27,18 @@ class PylablibSettings(CameraSettings):
         description="the camera connected to this computer, or a simulated one with the interface `dcam`",
     )
     serial: str = Field(
-        default="", description="serial number of the camera; empty: the only one that is connected"
+        default="", description="serial number of the camera, or empty for the only one connected"
     )
     model: str = Field(
-        default="", description="beginning of the camera's model name; other models are refused"
+        default="", description="beginning of the camera's model name. Other models are refused"
     )
     sdk: str = Field(
-        default="", description="file of the vendor's library; empty: where the vendor's installer puts it"
+        default="", description="file of the vendor's library, or empty for where its installer puts it"
     )
     readout_mode: str | None = Field(
         default=None,
         description="speed of the read-out by the name that the camera gives it, such as `slow` (ultra-quiet "
-        "scan of an ORCA-Quest); none: as the camera is set",
+        "scan of an ORCA-Quest), or none to leave the camera's",
     )
     trigger_edge: Literal["rising", "falling"] = Field(
         default="rising", description="edge of the external trigger that starts an exposure"
@@ -46,15 +46,15 @@ class PylablibSettings(CameraSettings):
     readout: Duration = Field(
         default=10e-3,
         description="time from the end of an exposure until its frame can be read, for budgets before the "
-        "camera is opened; the open camera reports its own",
+        "camera is opened. The open camera reports its own",
     )
     arming_time: Duration = Field(
         default=10e-3,
-        description="time from arming for a series until it can be triggered, for budgets; simulated "
+        description="time from arming for a series until it can be triggered, for budgets. Simulated "
         "cameras take this long",
     )
     cooling: Cooling | None = Field(
-        default=None, description="temperature of the sensor; none: the cooler is left as it is"
+        default=None, description="temperature of the sensor, or none to leave the cooler as it is"
     )
 
     def identities(self) -> tuple[str, ...]:

@@ -28,8 +28,8 @@ from labseq_pylon.settings import PylonSettings
 EMULATION: Final = "BaslerCamEmu"
 """pylon's class of emulated cameras."""
 
-OTHERWISE: Final = "to try things without a camera, set `camera: simulated`"
-IN_USE: Final = "another program may use it: close the pylon Viewer"
+OTHERWISE: Final = "To try things without a camera, set `camera: simulated`"
+IN_USE: Final = "close the pylon Viewer and other programs that use it"
 READY_S: Final = 1.0
 """How long a camera may take until it accepts a trigger, in seconds."""
 
@@ -229,10 +229,10 @@ def _why_not_one(serial: str | None, n_found: int, listed: str) -> str:
     if n_found > 1:
         return f"{n_found} cameras were found: {listed}; name the serial number of one as `camera`"
     if serial is not None:
-        text = f"no camera has the serial number '{serial}'; found {listed or 'no camera at all'}"
-        return f"{text}; check its cable and power, or name another as `camera`"
+        text = f"no camera has the serial number '{serial}' (found: {listed or 'none'})"
+        return f"{text}; check its cable and power, or name another camera as `camera`"
     text = "no Basler camera was found; check its cable and power"
-    return f"{text}, and its network address if it is a GigE camera; {OTHERWISE}"
+    return f"{text}, and its network address if it is a GigE camera. {OTHERWISE}"
 
 
 def _listed(infos: list[Any]) -> str:

@@ -14,7 +14,7 @@ from labseq_genicam.features import Number, Value
 from labseq.plugin import DeviceError
 from labseq.plugin.messages import install_hint, missing_package
 
-OTHERWISE: Final = "to try things without it, use another camera, for example `use: virtual`"
+OTHERWISE: Final = "To try things without it, use another camera, for example `use: virtual`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ def load_pypylon(name: str) -> Sdk:
             pylon, genicam = (importlib.import_module(f"pypylon.{part}") for part in ("pylon", "genicam"))
     except ImportError as error:
         text = f"the Python package 'pypylon' cannot be imported ({error})"
-        raise DeviceError(name, f"{text}; install it with {install_hint('pylon')}; {OTHERWISE}") from error
+        raise DeviceError(name, f"{text}; install it with {install_hint('pylon')}. {OTHERWISE}") from error
     return Sdk(name, pylon, genicam)
 
 

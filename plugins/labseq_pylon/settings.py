@@ -12,7 +12,7 @@ class PylonSettings(StandardSettings):
     camera: str | None = Field(
         default=None,
         min_length=1,
-        description="serial number of the camera; none: the only one that is connected; `simulated`: pylon's "
+        description="serial number of the camera, or none for the only one connected. `simulated` is pylon's "
         "emulated camera, which sees the simulated atoms",
     )
 

@@ -35,7 +35,7 @@ IDENTITY: Final = ("model", "serial_number", "firmware")
 
 
 class RefusedError(DeviceError):
-    """The instrument reported an error; sending the same again does not help."""
+    """The instrument reported an error. Sending the same again does not help."""
 
 
 class Instrument:
@@ -50,7 +50,7 @@ class Instrument:
         self._clock = clock
 
     def identify(self) -> dict[str, str]:
-        """Ask the instrument what it is; empty if the profile has no ``identify``."""
+        """Ask for the instrument's identity, empty if the profile has no ``identify``."""
         identify = self._settings.identify
         if identify is None:
             return {}
@@ -61,7 +61,7 @@ class Instrument:
             if match is None:
                 what = f"the instrument reports that it is '{clean(reply)}'"
                 raise DeviceError(
-                    self._device, f"{what}; expected '{clean(identify.reply)}'; is it the right port?"
+                    self._device, f"{what}, not '{clean(identify.reply)}'; is it the right port?"
                 )
             identity = {key: text for key, text in match.groupdict().items() if key in IDENTITY and text}
             return {"model": reply, **identity}
@@ -98,7 +98,7 @@ class Instrument:
 
         if command.makes and self._differing(command.makes) is None:
             return
-        # a toggle whose reply was lost may have been carried out: only the profile knows what may be repeated
+        # a toggle whose reply was lost may have been carried out, so only the profile knows what to repeat
         self._retried(send) if command.repeatable else send()
         end_s = self._clock.now() + timeout_s
         while (differing := self._differing(command.makes)) is not None:
@@ -123,7 +123,7 @@ class Instrument:
         return failures
 
     def message(self, name: str) -> SerialMessage:
-        """What a command without arguments sends, and what must come of it, for another process."""
+        """The text of a command without arguments, and its effect, for another process."""
         settings = self._settings
         command = settings.commands[name]
         answered = command.reply is not None
@@ -138,7 +138,7 @@ class Instrument:
         )
 
     def _question(self, name: str, state: bool | int | str) -> SerialMessage:
-        """Asks whether a value is as a command makes it."""
+        """The message that asks whether a value is as a command makes it."""
         settings, value = self._settings, self._settings.values[name]
         return SerialMessage(
             value.ask + settings.write_ends_with,
@@ -151,11 +151,11 @@ class Instrument:
         )
 
     def _differing(self, makes: Mapping[str, Scalar]) -> str | None:
-        """Describe the first value that is not as a command makes it; None if all are."""
+        """Describe the first value that is not as a command makes it, None if all are."""
         for name, made in makes.items():
             value = self._settings.values[name]
             if (reading := self.read(name)) != made:
-                return f"{name} is {value.shown(reading)}; expected {value.shown(made)}"
+                return f"{name} is {value.shown(reading)}, not {value.shown(made)}"
         return None
 
     def _refuse(self, pattern: str | None, text: str, reply: str) -> None:
@@ -179,8 +179,8 @@ class SerialDevice(Device):
     """An instrument on a serial line, described in the profile.
 
     A line that breaks in a shot fails the shot with ``TransientError``. The next call opens the port once
-    more, checks that it is the same instrument, and sends ``on_open`` again; if that fails, it is a
-    ``DeviceError``, which ends the run.
+    more, checks that it is the same instrument, and sends ``on_open`` again. If that fails, a ``DeviceError``
+    ends the run.
     """
 
     def __init__(self, settings: SerialSettings, context: Context) -> None:
@@ -203,17 +203,17 @@ class SerialDevice(Device):
                 self._instrument = self._connected()
 
     def close(self) -> None:
-        """Close the port; legal in any state."""
+        """Close the port. Legal in any state."""
         with self._lock:
             if self._instrument is not None:
                 self._instrument.line.close()
             self._instrument = None
 
     def safe_state(self) -> None:
-        """Send every command of the safe state, also after one that fails; legal in any state.
+        """Send every command of the safe state, even after one fails. Legal in any state.
 
         Raises:
-            DeviceError: Some failed; all were tried.
+            DeviceError: Some failed. All were tried.
         """
         instrument = self._instrument
         if instrument is None or not self._settings.safe_state:
@@ -241,11 +241,11 @@ class SerialDevice(Device):
 
         Args:
             name: Its name.
-            **arguments: Its arguments: quantities in SI, or as text such as "80 MHz".
+            **arguments: Its arguments, quantities in SI or as text such as "80 MHz".
 
         Raises:
             DeviceError: Not open, an unknown command or argument, no or a wrong reply.
-            LimitError: An argument is outside its limits; nothing was sent.
+            LimitError: An argument is outside its limits. Nothing was sent.
             TransientError: The line broke.
         """
         values = self._checked(name, arguments)
@@ -253,7 +253,7 @@ class SerialDevice(Device):
             self._ready().carry_out(name, values)
 
     def check_command(self, name: str, **arguments: Any) -> None:
-        """Check a command and its arguments; nothing is sent, and the device need not be open.
+        """Check a command and its arguments. Nothing is sent, and the device need not be open.
 
         Raises:
             DeviceError: An unknown command or argument, or one of another type.
@@ -262,7 +262,7 @@ class SerialDevice(Device):
         self._checked(name, arguments)
 
     def read(self, name: str) -> Scalar:
-        """Read a declared value; quantities are in SI.
+        """Read a declared value. Quantities are in SI.
 
         Raises:
             DeviceError: Not open, an unknown or implausible value, no or a wrong reply.
@@ -294,11 +294,11 @@ class SerialDevice(Device):
             is_fresh = name in self._readings and self._clock.now() - read_s < lock.max_age
             reading = reading if is_fresh else self.read(name)
             if not lock.allows(reading, value.quantity):
-                text = f"{name} is {value.shown(reading)}; the interlock expects {lock.shown(value.quantity)}"
+                text = f"{name} is {value.shown(reading)}, but must be {lock.shown(value.quantity)}"
                 raise DeviceError(self._name, f"{text}; {lock.message}" if lock.message else text)
 
     def self_test(self) -> None:
-        """Read every declared value; it must be plausible."""
+        """Read every declared value, which must be plausible."""
         for name in self._settings.values:
             self.read(name)
 
@@ -319,7 +319,7 @@ class SerialDevice(Device):
         }
 
     def _ready(self, *, on_open: bool = True) -> Instrument:
-        """The instrument; a line that broke is opened again."""
+        """The instrument. A broken line is opened again."""
         if self._instrument is None:
             raise DeviceError(self._name, "not open; call open() first")
         if self._instrument.line.broken:
@@ -349,12 +349,12 @@ class SerialDevice(Device):
         return instrument
 
     def _begin(self, instrument: Instrument) -> None:
-        """Send ``on_open``; after a failure also ``safe_state``."""
+        """Send ``on_open``, after a failure also ``safe_state``."""
         try:
             for name in self._settings.on_open:
                 instrument.carry_out(name, {})
         except LabseqError:
-            # half set up, with the port about to be closed: nothing else would make it safe
+            # half set up, with the port about to be closed, so nothing else would make it safe
             instrument.carry_out_all(self._settings.safe_state)
             raise
 

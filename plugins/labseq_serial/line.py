@@ -1,4 +1,4 @@
-"""The line to an instrument: what is sent and received, and everything that can go wrong with it."""
+"""The line to an instrument, its texts, replies and errors."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ from labseq_serial.simulated import SimulatedLine
 from labseq_serial.values import Scalar
 
 MAX_REPLY: Final = 4096
-"""Longest reply in bytes; more is noise."""
+"""Longest reply in bytes. More is noise."""
 
 
 class Line:
-    """An open port, and one exchange on it after the other.
+    """An open port, for one exchange at a time.
 
     Replies are without their end and surrounding spaces.
 
     Attributes:
-        broken: Whether the port was lost; it must be opened again.
+        broken: Whether the port was lost and must be opened again.
         aborted: Set by another thread to end a wait for a reply.
     """
 
@@ -54,7 +54,7 @@ class Line:
         self._free_s = clock.now() + settings.wait_after_open
 
     def identify(self) -> str:
-        """Ask the instrument what it is."""
+        """Ask the instrument for its identity."""
         identify = self._settings.identify
         return "" if identify is None else self._exchange(identify.ask, self._settings.timeout)
 
@@ -64,7 +64,7 @@ class Line:
         return self._exchange(value.ask, value.timeout or self._settings.timeout)
 
     def send(self, name: str, arguments: Mapping[str, Scalar]) -> str:
-        """Send a command with arguments in SI; the reply is "" if none comes."""
+        """Send a command with arguments in SI. The reply is "" if none comes."""
         command = self._settings.commands[name]
         timeout_s = command.timeout or self._settings.timeout
         return self._exchange(command.text(arguments), timeout_s, answered=command.reply is not None)
@@ -74,12 +74,12 @@ class Line:
         return serial_emergency(self._port, messages, self._settings.encoding, echo=self._settings.echo)
 
     def close(self) -> None:
-        """Close the port; legal in any state."""
+        """Close the port. Legal in any state."""
         with suppress(*BROKEN):
             self._port.close()
 
     def _exchange(self, text: str, timeout_s: float, *, answered: bool = True) -> str:
-        """Send a text and wait for the reply; what came before is dropped.
+        """Send a text and wait for the reply. Bytes from before are dropped.
 
         Raises:
             DeviceTimeoutError: No reply, or one without an end.
@@ -94,7 +94,7 @@ class Line:
         end = settings.read_ends_with.encode(settings.encoding) if answered else b""
         try:
             with self._unbroken(text, timeout_s):
-                self._port.reset_input_buffer()  # a late reply must not count as that to this text
+                self._port.reset_input_buffer()  # a late reply must not count as the reply to this text
                 self._port.write(sent)
             came = self._receive(text, sent if settings.echo else b"", end, timeout_s)
         finally:  # it may be busy although its reply was lost
@@ -106,7 +106,7 @@ class Line:
             raise DeviceError(self._device, f"{what}; check 'baud_rate', 'parity' and 'encoding'") from None
 
     def _receive(self, text: str, echo: bytes, end: bytes, timeout_s: float) -> bytes:
-        """Read the bytes between the echo and the end; nothing is read if both are empty."""
+        """Read the bytes between the echo and the end. Nothing is read if both are empty."""
         came = bytearray()
 
         def look(_: float) -> int | None:
@@ -134,7 +134,7 @@ class Line:
         waited = format_quantity(timeout_s, "time")
         if not came:
             what = f"no reply to '{clean(text)}' within {waited}"
-            return f"{what}; is it switched on? check 'baud_rate' and 'write_ends_with', or raise 'timeout'"
+            return f"{what}; switch it on, check 'baud_rate' and 'write_ends_with', or raise 'timeout'"
         end = clean(self._settings.read_ends_with)
         what = f"the reply to '{clean(text)}', '{_visible(came)}', did not end with '{end}' within {waited}"
         return f"{what}; check 'read_ends_with', 'echo' and 'baud_rate', or raise 'timeout'"
@@ -192,5 +192,5 @@ def _find(usb: UsbSettings, device: str) -> str:
         names = ", ".join(f"{port.device} ({port.serial_number})" for port in fits)
         text = f"{len(fits)} adapters have {described}: {names}; add 'serial' to tell them apart"
         raise DeviceError(device, text)
-    text = f"no USB adapter has {described}; expected {ports_text()}; is it plugged in?"
+    text = f"no USB adapter has {described}; plug it in, or choose one of {ports_text()}"
     raise DeviceError(device, text)

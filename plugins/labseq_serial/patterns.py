@@ -1,4 +1,4 @@
-"""Texts on the line: commands with places for arguments, and patterns of replies."""
+"""Texts on the line, which are commands with places for arguments, and patterns of replies."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def pieces(text: str) -> list[Piece]:
         >>> pieces("FREQ {frequency:.3f};OUTP ON")
         [Piece(literal='FREQ ', name='frequency', spec='.3f'), Piece(literal=';OUTP ON', name='', spec='')]
     """
-    expected = "expected {name} or {name:format}; {{ for a brace"
+    expected = "expected {name} or {name:format}, or {{ for a brace"
     try:
         parts = list(string.Formatter().parse(text))
     except ValueError as error:
@@ -72,7 +72,7 @@ def compiled(pattern: str) -> re.Pattern[str]:
         return re.compile(pattern, re.DOTALL)
     except re.error as error:
         text = f"'{pattern}' is not a regular expression: {error}"
-        raise ValueError(f"{text}; expected one; put a \\ before a special character") from None
+        raise ValueError(f"{text}; put a \\ before a special character") from None
 
 
 def example_of(pattern: str, value: str = "") -> str | None:
@@ -81,7 +81,7 @@ def example_of(pattern: str, value: str = "") -> str | None:
     Other named groups become their names, and escaped characters themselves.
 
     Returns:
-        None if that does not match the pattern: then somebody must write an example.
+        None if that does not match the pattern, so that the profile needs an example.
 
     Example:
         >>> example_of(r"T=(?P<value>[-+.0-9eE]+) degC", "21.5")

@@ -1,4 +1,4 @@
-"""An instrument on a serial line, as the profile describes it: port, commands, checks of all of it."""
+"""Settings of an instrument on a serial line with its port and commands, and their checks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from labseq_serial.values import ArgumentSettings, Scalar, ValueSettings, placed
 RESERVED: Final = frozenset({"self", "name", "owner", "timeout_s", "function"})
 """Names that arguments cannot have, because labseq's own calls use them."""
 _SLACK: Final = 1e-9
-"""Part of a limit by which the conversion of units may miss it."""
+"""Relative error of a limit that the conversion of units may cause."""
 SIMULATED: Final = "simulated"
 """The port of a simulated instrument."""
 _MADE: Final[Mapping[str, tuple[type[Scalar], str]]] = {
@@ -38,7 +38,7 @@ class UsbSettings(Settings):
 
     @property
     def given(self) -> dict[str, int | str]:
-        """What is given, by the names that pyserial has for it."""
+        """The given numbers, by pyserial's names."""
         wanted = {"vid": self.vid, "pid": self.pid, "serial_number": self.serial}
         return {key: value for key, value in wanted.items() if value is not None}
 
@@ -59,14 +59,14 @@ class IdentifySettings(Settings):
 
     ask: Text = Field(description="text that is sent")
     reply: Text = Field(
-        description="pattern of the reply; groups `model`, `serial_number` and `firmware` are shown by "
+        description="pattern of the reply. Groups `model`, `serial_number` and `firmware` are shown by "
         "`labseq devices`"
     )
     example: Text | None = Field(default=None, description="an example of a reply, for dry runs")
 
     @property
     def simulated_reply(self) -> str | None:
-        """A reply that matches; None if the profile needs an example."""
+        """A reply that matches, None if the profile needs an example."""
         return example_of(self.reply) if self.example is None else self.example
 
     @model_validator(mode="after")
@@ -78,25 +78,25 @@ class IdentifySettings(Settings):
 class CommandSettings(Settings):
     """A command of the instrument."""
 
-    send: Text = Field(description="text that is sent; `{name}` or `{name:.3f}` is an argument, `{{` a brace")
+    send: Text = Field(description="text to send. `{name}` or `{name:.3f}` is an argument, `{{` a brace")
     arguments: dict[str, ArgumentSettings] = Field(default={}, description="its arguments, by name")
     reply: str | None = Field(
         default=None,
-        description='pattern that the reply must match, as that of a value; `""` for an empty line or a '
-        "mere prompt; none: no reply comes",
+        description='pattern that the reply must match, like that for a value. `""` is an empty line or a '
+        "mere prompt. With none, no reply comes",
     )
     error: Text | None = Field(default=None, description="pattern of a reply that reports an error")
     makes: dict[str, bool | int | str] = Field(
         default={},
-        description="values that the command leads to: they are read before, and if they have these values "
-        "already nothing is sent, and after, until they have them",
+        description="values that the command leads to. They are read first, and if they have these values "
+        "already, nothing is sent. Afterwards they are read until they have them",
     )
     repeatable: bool = Field(
         default=False, description="whether it may be sent again when the reply is missing or unreadable"
     )
     timeout: PositiveDuration | None = Field(
         default=None,
-        description="how long the reply, and what the command makes, may take; none: as for all",
+        description="how long the reply and the values of `makes` may take, or none for `timeout` above",
     )
     example: str | None = Field(default=None, description="an example of a reply, for dry runs")
 
@@ -107,7 +107,7 @@ class CommandSettings(Settings):
 
     @property
     def simulated_reply(self) -> str | None:
-        """A reply that matches; None if none comes, or the profile needs an example."""
+        """A reply that matches, None if none comes or the profile needs an example."""
         if self.reply is None or self.example is not None:
             return self.example
         return example_of(self.reply)
@@ -162,7 +162,7 @@ class CommandSettings(Settings):
         return self
 
     def _check_rounded(self, name: str, key: str, text: str) -> None:
-        """Rounding keeps the order of numbers, so that it is enough to look at the limits."""
+        """Check the limits as they are sent. Rounding keeps the order, so this covers all values."""
         argument = self.arguments[name]
         low, high = argument.limits
         slack = _SLACK * max(abs(low), abs(high))
@@ -183,7 +183,7 @@ class CommandSettings(Settings):
         if self.reply is None:
             for key in ("error", "example"):
                 if getattr(self, key) is not None:
-                    what = f"'{key}' is about a reply, but no 'reply' is waited for"
+                    what = f"'{key}' is about a reply, but there is no 'reply'"
                     raise setting_error(what, "a 'reply'", at=(key,), key=True)
             return self
         check_reply(self.reply, self.example)
@@ -210,10 +210,10 @@ class SerialSettings(Settings):
         default="none", description="how the instrument signals that it can take no more"
     )
     write_ends_with: Text = Field(
-        description='what ends a command, in double quotes, as `"\\r"`; it is added to each text'
+        description='what ends a command, in double quotes, as `"\\r"`. It is added to each text'
     )
     read_ends_with: Text = Field(
-        description='what ends a reply: the end of the line, or the next prompt, as `"\\r\\n> "`',
+        description='what ends a reply, either a line end or the next prompt, as `"\\r\\n> "`',
     )
     encoding: Literal["ascii", "latin-1", "utf-8"] = Field(default="ascii", description="of the characters")
     echo: bool = Field(default=False, description="whether the instrument repeats what it is sent")
@@ -227,22 +227,22 @@ class SerialSettings(Settings):
     )
     pause: Duration = Field(default=0.0, description="time that the instrument needs before the next command")
     wait_after_open: Duration = Field(
-        default=0.0, description="time that it needs after the port was opened: an Arduino restarts then"
+        default=0.0, description="time that it needs after the port was opened, as an Arduino restarts then"
     )
     identify: IdentifySettings | None = Field(
-        default=None, description="how the instrument reports what it is; another one is refused"
+        default=None, description="how the instrument reports what it is. Any other instrument is refused"
     )
     on_open: tuple[Text, ...] = Field(
-        default=(), description="commands without arguments that are sent when it was opened: `[remote]`"
+        default=(), description="commands without arguments that are sent once it is open, such as `[remote]`"
     )
     commands: dict[Text, CommandSettings] = Field(default={}, description="its commands, by name")
     values: dict[Text, ValueSettings] = Field(default={}, description="values that can be read, by name")
     safe_state: tuple[Text, ...] = Field(
-        default=(), description="commands without arguments that make it safe; none: it is left as it is"
+        default=(), description="commands without arguments that make it safe, or none to leave it as it is"
     )
 
     def texts(self) -> Iterator[tuple[tuple[str, ...], str]]:
-        """All texts that are sent, with their places; commands without their arguments."""
+        """All texts that are sent, with their places. Commands are without their arguments."""
         if self.identify is not None:
             yield ("identify", "ask"), self.identify.ask
         for name, value in self.values.items():
@@ -251,12 +251,12 @@ class SerialSettings(Settings):
             yield ("commands", name, "send"), command.send
 
     def why_unsendable(self, text: str) -> str:
-        """Why a text cannot be sent, and what to do; "" if it can be sent."""
+        """Why a text cannot be sent, and what to do, "" if it can be sent."""
         if self.write_ends_with in text:
-            what = f"'{clean(text)}' holds what ends a command"
-            return f"{what}; expected it without: 'write_ends_with' is added to what is sent"
+            what = f"'{clean(text)}' contains the end of a command"
+            return f"{what}; leave it out, since 'write_ends_with' is added to each text"
         if not _can_be(text, self.encoding):
-            return f"'{clean(text)}' is not {self.encoding}; expected another 'encoding', or other characters"
+            return f"'{clean(text)}' is not {self.encoding}; use another 'encoding', or other characters"
         return ""
 
     @property
@@ -265,7 +265,7 @@ class SerialSettings(Settings):
         return [name for name, value in self.values.items() if value.poll]
 
     def identities(self) -> tuple[str, ...]:
-        """What only one process can use of it."""
+        """Names of the line, which only one process can use."""
         if self.usb is None:
             return () if self.port in (None, SIMULATED) else port_identities(self.port)
         fits = self.usb.ports()
@@ -344,7 +344,7 @@ class SerialSettings(Settings):
         return self
 
     def _simulated_replies(self) -> Iterator[tuple[tuple[str, ...], str, str | None]]:
-        """Place and pattern of each reply, and what a simulated instrument would reply."""
+        """Place and pattern of each reply, and the simulated instrument's reply."""
         if self.identify is not None:
             yield ("identify",), self.identify.reply, self.identify.simulated_reply
         for name, command in self.commands.items():
@@ -359,7 +359,7 @@ def unknown(
 ) -> PydanticCustomError:
     """The error for a name that the profile does not declare."""
     meant = closest(name, names)
-    expected = one_of(list(names)) if names else "none: the profile declares none"
+    expected = one_of(list(names)) if names else "none, as the profile declares none"
     return setting_error(what, expected, f"did you mean '{meant}'?" if meant else "", at=at, key=key)
 
 
@@ -380,7 +380,7 @@ def check_pattern(pattern: str | None, key: str) -> re.Pattern[str] | None:
 
 
 def check_reply(pattern: str, example: str | None) -> None:
-    """Refuse what is not a pattern, and an example that does not match it."""
+    """Refuse an invalid pattern, and an example that does not match it."""
     found = check_pattern(pattern, "reply")
     if found is not None and example is not None and found.fullmatch(example) is None:
         what = f"the reply '{clean(example)}' does not match"

@@ -1,4 +1,4 @@
-"""An instrument that is simulated from its description, in place of the line to a real one."""
+"""An instrument simulated from its description, which replaces the line to a real one."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from labseq_serial.values import Scalar
 
 
 class SimulatedLine:
-    """Keeps what commands set, and replies as the instrument would; has the methods of a ``Line``.
+    """Keeps the values that commands set, and replies like the instrument. It has the methods of a ``Line``.
 
-    A value that has the name of an argument is that argument's last value; a value that a command ``makes``
-    is as the command made it; any other value is that of its example, or within its limits. Texts take the
-    time that they take on a line.
+    A value with the name of an argument is that argument's last value. A value that a command ``makes`` is as
+    the command made it. Any other value is its example's, or within its limits. Texts take as long as on a
+    line.
     """
 
     broken = False
@@ -29,7 +29,7 @@ class SimulatedLine:
         self._free_s = clock.now() + settings.wait_after_open
 
     def identify(self) -> str:
-        """What the instrument is."""
+        """The instrument's identity."""
         identify = self._settings.identify
         return "" if identify is None else self._exchanged(identify.ask, identify.simulated_reply)
 
@@ -46,7 +46,7 @@ class SimulatedLine:
         return self._exchanged(command.text(arguments), command.simulated_reply)
 
     def emergency(self, messages: Sequence[SerialMessage]) -> Emergency | None:
-        """None: there is no port that another process could open."""
+        """None, as there is no port that another process could open."""
         del messages
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Arguments of commands and values of an instrument: types, units, limits."""
+"""Types, units and limits of the arguments of commands and of an instrument's values."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Unit:
     """The unit of a number on the line.
 
     Attributes:
-        name: As the profile writes it; "" for a bare number.
-        dimension: One of labseq's dimensions: the number is a quantity then, in SI for the user; "" if
-            labseq does not know the unit: the user's number is the one on the line.
+        name: As the profile writes it, "" for a bare number.
+        dimension: One of labseq's dimensions, so that the user's number is a quantity in SI. "" if labseq
+            does not know the unit, so that the user's number is the number on the line.
     """
 
     name: str = ""
@@ -48,12 +48,12 @@ class Unit:
             return cls(name, _DIMENSION_OF[name])
         alike = next((known for known in _DIMENSION_OF if known.lower() == name.lower()), None)
         if alike is not None:
-            raise ValueError(f"labseq knows no unit '{name}'; expected another one; did you mean '{alike}'?")
+            raise ValueError(f"labseq knows no unit '{name}'; did you mean '{alike}'?")
         return cls(name)
 
     @property
     def is_si(self) -> bool:
-        """Whether the number on the line is the one that the user gives."""
+        """Whether the number on the line is the user's number."""
         return not self.dimension or UNITS[self.dimension].get(self.name) == 1.0
 
     @property
@@ -67,10 +67,10 @@ class Unit:
         return next(iter(UNITS[self.dimension])) if self.dimension else self.name
 
     def read(self, given: object) -> float:
-        """A number as the user gives it: SI, or text with a unit.
+        """A number as the user gives it, SI or text with a unit.
 
         Raises:
-            ValueError: It is not a finite number, or one of another dimension.
+            ValueError: It is not a finite number, or has another dimension.
         """
         number = self._number(given)
         if not math.isfinite(number):
@@ -148,24 +148,24 @@ class LimitedSettings(Settings):
 
     unit: Text | None = Field(
         default=None,
-        description="unit of the number on the line; with one that labseq knows, as MHz or degC, it is a "
-        "quantity in sequences and results, else, as with mA, the number itself",
+        description="unit of the number on the line. With a unit that labseq knows, as MHz or degC, it is a "
+        "quantity in sequences and results. With others, such as mA, it is the number itself",
     )
-    min: Number | None = Field(default=None, description="least that it may be")
+    min: Number | None = Field(default=None, description="lowest allowed value")
     max: Number | None = Field(default=None, description="highest allowed value")
 
     @property
     def quantity(self) -> Unit:
-        """The unit; that of a bare number where none is given."""
+        """The unit, or a bare number's where none is given."""
         return Unit.of(self.unit or "")
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Least and most, in SI; infinite where there is none."""
+        """Least and most, in SI, infinite where there is none."""
         return limits_of(self.min, self.max, self.quantity)
 
     def allows(self, value: Scalar) -> bool:
-        """Whether a value, in SI, is within the limits; anything but a number is."""
+        """Whether a value, in SI, is within the limits. Anything but a number is."""
         return isinstance(value, str | bool) or self.limits[0] <= value <= self.limits[1]
 
     def shown(self, value: Scalar) -> str:
@@ -179,7 +179,7 @@ class LimitedSettings(Settings):
         return format_limits(*self.limits, self.quantity)
 
     def check_keys(self, type_name: str) -> None:
-        """Refuse keys that are not for a type, and limits that are none."""
+        """Refuse keys that are not for a type, and invalid limits."""
         others = set[str]().union(*_KEYS.values()) - _KEYS[type_name]
         for key in sorted(others & self.model_fields_set):
             types = " or ".join(kind for kind, keys in _KEYS.items() if key in keys)
@@ -190,8 +190,8 @@ class LimitedSettings(Settings):
 class ArgumentSettings(LimitedSettings):
     """An argument of a command."""
 
-    type: Literal["float", "int", "text"] = Field(default="float", description="what it is")
-    choices: tuple[Text, ...] = Field(default=(), description="what it may be, of a text; none: any text")
+    type: Literal["float", "int", "text"] = Field(default="float", description="type of the value")
+    choices: tuple[Text, ...] = Field(default=(), description="allowed texts, or none for any text")
 
     def value_of(self, given: object) -> Scalar:
         """The value of an argument as a step gives it, in SI.
@@ -212,7 +212,7 @@ class ArgumentSettings(LimitedSettings):
         return self.quantity.to_line(value) if isinstance(value, float) else value
 
     def extremes(self) -> list[tuple[str, Scalar]]:
-        """The limits of a number, with their keys; one value of a text."""
+        """The limits of a number, with their keys, or one value of a text."""
         if self.type not in NUMBERS:
             return [("choices", (*self.choices, "A")[0])]
         low, high = self.limits
@@ -251,7 +251,7 @@ def check_limits(unit: str | None, low: Number | None, high: Number | None, *at:
         unit: The unit, as the profile has it.
         low: The least.
         high: The most.
-        *at: Where the limits are, below what is validated.
+        *at: Where the limits are, below the validated model.
     """
     try:
         quantity = Unit.of(unit or "")
@@ -272,12 +272,12 @@ def check_limits(unit: str | None, low: Number | None, high: Number | None, *at:
 
 
 def limits_of(low: Number | None, high: Number | None, quantity: Unit) -> tuple[float, float]:
-    """Least and most, in SI; infinite where there is none."""
+    """Least and most, in SI, infinite where there is none."""
     return -math.inf if low is None else quantity.read(low), math.inf if high is None else quantity.read(high)
 
 
 def format_limits(low: float, high: float, quantity: Unit) -> str:
-    """Describe limits; infinite ones are left out."""
+    """Describe limits, without infinite ones."""
     if math.isinf(low):
         return "anything" if math.isinf(high) else f"at most {quantity.shown(high)}"
     if math.isinf(high):
@@ -301,7 +301,7 @@ class InterlockSettings(Settings):
     message: str = Field(default="", description="what to do if the condition is not met, for the message")
     max_age: Duration = Field(
         default=0.0,
-        description="how old a reading may be; each check that needs a new one waits for the instrument",
+        description="how old a reading may be. Each check that needs a new one waits for the instrument",
     )
 
     def allows(self, value: Scalar, quantity: Unit) -> bool:
@@ -312,7 +312,7 @@ class InterlockSettings(Settings):
         return not isinstance(value, str) and low <= value <= high
 
     def limits(self, quantity: Unit) -> tuple[float, float]:
-        """Least and most, in SI; infinite where there is none."""
+        """Least and most, in SI, infinite where there is none."""
         return limits_of(self.min, self.max, quantity)
 
     def shown(self, quantity: Unit) -> str:
@@ -327,14 +327,14 @@ class InterlockSettings(Settings):
 class ValueSettings(LimitedSettings):
     """A value that is read from the instrument."""
 
-    type: Literal["float", "int", "bool", "text"] = Field(default="float", description="what it is")
+    type: Literal["float", "int", "bool", "text"] = Field(default="float", description="type of the value")
     words: tuple[Text, Text] = Field(
-        default=("0", "1"), description="what false and true are on the line, of a bool"
+        default=("0", "1"), description="texts for false and true on the line, for a bool"
     )
     ask: Text = Field(description="text that is sent")
     reply: Text = Field(
         default=f"(?P<{VALUE}>.*)",
-        description="pattern of the reply: a regular expression for all of it, without spaces at its ends, "
+        description="regular expression for the whole reply, without the spaces at its ends, "
         f"with the value in a group `(?P<{VALUE}>...)`",
     )
     error: Text | None = Field(default=None, description="pattern of a reply that reports an error")
@@ -343,14 +343,14 @@ class ValueSettings(LimitedSettings):
     )
     interlock: InterlockSettings | None = Field(
         default=None,
-        description="condition on the value; if it is not met, no atoms are picked up and the run ends",
+        description="condition on the value. If it is not met, no atoms are picked up and the run ends",
     )
     timeout: PositiveDuration | None = Field(
-        default=None, description="how long the reply may take; none: as for all"
+        default=None, description="how long the reply may take, or none for the instrument's `timeout`"
     )
     example: Text | None = Field(
         default=None,
-        description="an example of a reply, for dry runs; needed if the pattern, with a value in place of "
+        description="an example of a reply, for dry runs. Needed if the pattern, with a value in place of "
         "the group, does not match itself",
     )
 
@@ -370,10 +370,9 @@ class ValueSettings(LimitedSettings):
         return value
 
     def reply_with(self, value: Scalar) -> str | None:
-        """A reply with this value, as a simulated instrument gives it; None if the profile needs an example.
+        """A reply with this value by a simulated instrument, None if the profile needs an example.
 
-        The value replaces that of the example; if the result does not match the pattern, the reply is the
-        example as it is.
+        The value replaces the example's. If the result does not match the pattern, the reply is the example.
         """
         if self.example is None:
             return example_of(self.reply, self._written(value))
@@ -387,7 +386,7 @@ class ValueSettings(LimitedSettings):
 
     @property
     def typical(self) -> Scalar:
-        """That of the example; without one the value nearest to 0 on the line that all limits allow."""
+        """The example's value, or else the value nearest to 0 on the line that all limits allow."""
         if self.example is not None:
             return self.value_in(self.example)
         lock = self.interlock or InterlockSettings()
@@ -439,7 +438,7 @@ class ValueSettings(LimitedSettings):
                 raise placed(error, key) from None
             if key == "reply" and VALUE not in pattern.groupindex:
                 what = f"'{clean(self.reply)}' has no group '{VALUE}'"
-                raise setting_error(what, f"the value in brackets: (?P<{VALUE}>...)", at=(key,))
+                raise setting_error(what, f"the value in brackets, (?P<{VALUE}>...)", at=(key,))
         return self
 
     @model_validator(mode="after")

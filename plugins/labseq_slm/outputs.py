@@ -77,8 +77,8 @@ class Display:
         if tuple(screen.shape) != settings.pixels:
             self.close()
             came, expected = (f"{rows} x {columns}" for rows, columns in (screen.shape, settings.pixels))
-            text = f"display {settings.display} has {came} pixels; expected {expected}, as `pixels` says"
-            raise DeviceError(self._name, f"{text}: choose another `display`, or set its resolution")
+            text = f"display {settings.display} has {came} pixels, but `pixels` says {expected}"
+            raise DeviceError(self._name, f"{text}; choose another `display`, or set its resolution")
 
     def show(self, levels: Levels) -> None:
         """Show grey levels; integers are displayed as they are."""

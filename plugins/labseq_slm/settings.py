@@ -47,10 +47,10 @@ class SlmSettings(Settings):
 
     output: Literal["display", "file", "simulated"] = Field(
         default="display",
-        description="where the grey levels go: to a display of this computer, through the package "
-        "`slmsuite`; to a PNG file that another program shows; or to an SLM that exists only in software",
+        description="where the grey levels go, either to a display of this computer, through the package "
+        "`slmsuite`, to a PNG file that another program shows, or to a simulated SLM",
     )
-    display: int = Field(default=1, ge=0, description="number of the display; 0 is usually the main screen")
+    display: int = Field(default=1, ge=0, description="number of the display. 0 is usually the main screen")
     image: FilePath | None = Field(
         default=None, description="picture (PNG) for `output: file`, replaced at each change"
     )
@@ -61,7 +61,7 @@ class SlmSettings(Settings):
     wavelength: PositiveLength = Field(default=808e-9, description="of the light")
     focal_length: PositiveLength = Field(
         default=15e-3,
-        description="effective focal length from the SLM to the atoms: that of the objective over the "
+        description="effective focal length from the SLM to the atoms, the objective's over the "
         "magnification of the telescope before it",
     )
     beam_waist: PositiveLength = Field(default=4.5e-3, description="1/e^2 radius of the light on the SLM")
@@ -74,13 +74,13 @@ class SlmSettings(Settings):
     mirrored: bool = Field(default=False, description="whether the optics mirror left and right")
     look_up_table: FilePath | None = Field(
         default=None,
-        description="file (.npy) of 256 phases in rad, those of the grey levels 0 to 255; none: they rise "
+        description="file (.npy) of the phases of the grey levels 0 to 255, in rad. With none, they rise "
         "linearly by 2 pi / 256 from level to level",
     )
     correction: FilePath | None = Field(
         default=None,
-        description="the manufacturer's correction of the surface: grey levels of all pixels, 256 for 2 pi, "
-        "in a picture of 8 bits (PNG, BMP) or a .npy file; none: the surface counts as flat",
+        description="the manufacturer's correction of the surface, grey levels of all pixels, 256 for 2 pi, "
+        "in a picture of 8 bits (PNG, BMP) or a .npy file, or none for a flat surface",
     )
     zernike: ZernikeSettings = Field(
         default=ZernikeSettings(), description="phases that are added to correct aberrations"
@@ -89,7 +89,7 @@ class SlmSettings(Settings):
         default=60e-3, description="time from new grey levels until the liquid crystal has followed"
     )
     errors: SimulatedErrors = Field(
-        default=SimulatedErrors(), description="of the simulated SLM, see `output: simulated`"
+        default=SimulatedErrors(), description="errors of the simulated SLM, see `output: simulated`"
     )
 
     @property

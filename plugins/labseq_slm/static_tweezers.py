@@ -137,7 +137,7 @@ class SlmStaticTweezers(StaticTweezers):
         self._opened()
         if depth not in (0.0, 1.0) or not 0 <= duration_s < np.inf:
             value = f"to {depth:g} of the nominal depth within {duration_s:g} s"
-            limit = "0 or 1: an SLM only distributes the light"
+            limit = "0 or 1, since an SLM only distributes the light"
             raise LimitError(f"{self._name}: ramp", value, limit)
         self.start() if depth else self.safe_state()
 

@@ -7,7 +7,7 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the static tweezers ``soapy``; in a dry run on a simulated radio."""
+    """Offer the static tweezers ``soapy``, in a dry run on a simulated radio."""
     tweezers, settings = (
         "labseq_soapy.static_tweezers:SoapyStaticTweezers",
         "labseq_soapy.settings:SoapySettings",

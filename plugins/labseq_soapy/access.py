@@ -1,4 +1,4 @@
-"""The radio that a profile names, and a streaming process that an earlier labseq left with it."""
+"""The radio of a profile, and a streaming process that an earlier labseq left with it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class RealRadio:
         """The array was off, and is on again."""
 
     def disconnect(self) -> None:
-        """The radio was closed; no effect if it is not connected."""
+        """The radio was closed. No effect if it is not connected."""
 
 
 def choose_radio(settings: SoapySettings, context: Context) -> RealRadio | SimulatedRadio:
@@ -79,12 +79,12 @@ def state_folder() -> Path:
 
 
 def marker_of(device: str) -> Path:
-    """File for the number of a process that runs this radio without labseq; deleting it ends the process."""
+    """File with the number of a process that runs this radio without labseq. Deleting it ends the process."""
     return state_folder() / f"soapy-{hashlib.sha256(device.encode()).hexdigest()[:16]}.alone"
 
 
 def end_stale_process(name: str, marker: Path, clock: Clock) -> None:
-    """End the process that an earlier labseq left behind with this radio, if there is one; it ramps down.
+    """End a process that an earlier labseq left behind with this radio. It ramps down.
 
     Raises:
         DeviceError: It does not end.

@@ -1,10 +1,10 @@
 """Switches a radio off from another process, after labseq has died or hangs.
 
-labseq's watchdog loads this file by its path; it needs nothing but Python's standard library. The
-streaming process, which alone has the radio open, is asked to end: it ramps the tones down and closes the
-radio. If it hangs it is killed, and then the radio's buffer runs dry. Its transmitters stay on with their
-gain until somebody opens it again, and the leakage of the local oscillator with them; so another process of
-the streaming program opens the radio, sets the lowest gains and closes it.
+labseq's watchdog loads this file by its path. It needs nothing but Python's standard library. The streaming
+process, which alone has the radio open, is asked to end. It ramps the tones down and closes the radio. If it
+hangs it is killed, and then the radio's buffer runs dry. Its transmitters stay on with their gain and the
+leakage of the local oscillator until somebody opens it again. So another process of the streaming program
+opens the radio, sets the lowest gains and closes it.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from typing import Any
 END_S = 0.5
 """How long the streaming process may take to end in addition to its ramp."""
 KILL_S = 5.0
-"""How long the system may take to end a killed process: a driver may keep it in the kernel."""
+"""How long the system may take to end a killed process, which a driver may keep in the kernel."""
 OPEN_S = 60.0
-"""How long a radio may take to open: some load their firmware."""
+"""How long a radio may take to open. Some load their firmware."""
 PAUSE_S = 1e-3
-STAYS_ON = "it plays nothing any more, but its transmitters stay on with their gain: switch it off by hand"
+STAYS_ON = "It plays nothing any more, but its transmitters stay on with their gain; switch it off by hand"
 
 
 class EmergencyError(Exception):
-    """The radio could not be switched off; the text says why."""
+    """The radio could not be switched off. The text says why."""
 
 
 def start_of(pid: int) -> int:
-    """When a process was started, in ticks since the computer's start; 0 if the system does not say."""
+    """When a process was started, in ticks since the computer's start, 0 if the system does not say."""
     with suppress(OSError, ValueError, IndexError):
         return int(_status(pid)[19])
     return 0
 
 
 def _status(pid: int) -> list[str]:
-    """The fields of /proc/PID/stat after the name: state, parent, ..."""
+    """The fields of /proc/PID/stat after the name, from the state on."""
     return Path(f"/proc/{pid}/stat").read_text("ascii", "replace").rpartition(")")[2].split()
 
 
@@ -55,13 +55,13 @@ def off(
     channels: Sequence[int],
     program: str,
 ) -> str:
-    """End the streaming process, and switch the transmitters off if it did not; can be repeated.
+    """End the streaming process, and switch the transmitters off if it did not. Can be repeated.
 
     Args:
         pid: Number of the streaming process.
-        started: Its start, by :func:`start_of`: numbers of processes are used again.
+        started: Its start, by :func:`start_of`, since numbers of processes are used again.
         opened: File that exists while it has the radio open.
-        ramp_s: How long its ramp to zero takes, with what the radio has buffered.
+        ramp_s: How long its ramp to zero takes, with the radio's buffer.
         device: Arguments that open the radio.
         channels: Channels that transmit.
         program: Module that streams to it.
@@ -91,7 +91,7 @@ def _left_open(opened: str, pid: int) -> bool:
 
 
 def _end(pid: int, started: int, ramp_s: float) -> bool:
-    """End the process; returns whether it had to be killed."""
+    """End the process, and return whether it had to be killed."""
     try:
         if os.name != "nt" and _runs(pid, started):  # elsewhere this kills it, and it ends by itself
             os.kill(pid, signal.SIGTERM)
@@ -108,7 +108,7 @@ def _end(pid: int, started: int, ramp_s: float) -> bool:
 
 
 def _ended(pid: int, started: int, longest_s: float) -> bool:
-    """Wait until a process has ended; returns whether it has."""
+    """Wait until a process has ended, and return whether it has."""
     deadline_s = time.monotonic() + longest_s
     while _runs(pid, started):
         if time.monotonic() > deadline_s:
@@ -158,8 +158,8 @@ def _switch_off_again(device: str, channels: Sequence[int], program: str) -> str
             check=False,
         )
     except subprocess.TimeoutExpired as error:
-        raise EmergencyError(f"the radio '{device}' does not open within {OPEN_S:g} s: {STAYS_ON}") from error
+        raise EmergencyError(f"the radio '{device}' does not open within {OPEN_S:g} s. {STAYS_ON}") from error
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or [f"code {done.returncode}"])[-1]
-        raise EmergencyError(f"the radio '{device}' cannot be opened again: {reason}; {STAYS_ON}")
+        raise EmergencyError(f"the radio '{device}' cannot be opened again: {reason}. {STAYS_ON}")
     return "radio opened again, lowest gains set, closed"

@@ -1,4 +1,4 @@
-"""The connection to the streaming process: start, commands, supervision, end."""
+"""The connection to the streaming process, with its start, commands, supervision and end."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ from labseq.plugin import Clock, DeviceError, wait_for
 from labseq_soapy import emergency
 
 OPEN_S: Final = 60.0
-"""How long a radio may take to open: some load their firmware."""
+"""How long a radio may take to open. Some load their firmware."""
 SILENT_S: Final = 6.0
-"""A streaming process that sends nothing for so long, once the radio is open, hangs.
-
-It is less than labseq waits for any call, so that the error names the process.
+"""A streaming process that sends nothing for this long with its radio open counts as hung. labseq waits
+longer for any call, so that the error names the process.
 """
 END_S: Final = 3.0
 """How long the process may take to end in addition to its ramp."""
@@ -43,8 +42,8 @@ class Link:
 
     Attributes:
         pid: Number of the process.
-        facts: What the radio reported; None until it is open.
-        status: How often the radio reported each error: "all" of them, those while the array was "lit".
+        facts: Facts that the radio reported, None until it is open.
+        status: How often the radio reported each error, in "all" and while the array was "lit".
     """
 
     def __init__(
@@ -84,14 +83,14 @@ class Link:
             threading.Thread(target=work, name=f"{name} {work.__name__}", daemon=True)
             for work in (self._listen, self._beat)
         ]
-        with contextlib.suppress(OSError):  # it has ended already; wait_open() reports why
+        with contextlib.suppress(OSError):  # it has ended already, and wait_open() reports why
             self._send(asdict(setup))
         for thread in self._threads:
             thread.start()
 
     @property
     def hangs(self) -> bool:
-        """Whether the process runs but is silent; while the radio is being opened it always is."""
+        """Whether the process runs but is silent, as it always is while the radio is being opened."""
         is_open = self.facts is not None and not self._ended
         return is_open and time.monotonic() - self._received_s > SILENT_S
 
@@ -110,7 +109,7 @@ class Link:
         }
 
     def wait_open(self) -> Facts:
-        """Wait until the radio is open and streams silence; returns what it reports.
+        """Wait until the radio is open and streams silence, and return its facts.
 
         Raises:
             DeviceError: It cannot be opened or set up.
@@ -120,7 +119,7 @@ class Link:
         return self.facts
 
     def load(self, loop: Samples, fade_s: float) -> None:
-        """Play another loop, float32 (2, 2 n), its channels in order; wait until it is at the connectors."""
+        """Play another loop, float32 (2, 2 n), channels in order, and wait until it is at the connectors."""
         with tempfile.TemporaryDirectory(prefix="labseq-") as folder:
             file = Path(folder) / "loop.npy"
             np.save(file, loop)
@@ -131,11 +130,11 @@ class Link:
         self._do("ramp", depth=depth, duration_s=duration_s)
 
     def release(self, n_samples: int) -> None:
-        """Play silence for some samples, then the loop again; wait until that is at the connectors."""
+        """Play silence for some samples, then the loop again, and wait until that is at the connectors."""
         self._do("release", n_samples=n_samples)
 
     def leave(self) -> None:
-        """Have the process go on alone; it ends when its marker file is deleted, or by a signal."""
+        """Let the process run alone until its marker file is deleted or a signal ends it."""
         self._do("leave")
         self._closing.set()
         with contextlib.suppress(OSError):
@@ -151,11 +150,11 @@ class Link:
             dark = "" if self.facts is None else "; the array is dark"
             raise DeviceError(self._name, f"{self._ended}{dark}")
         if self.hangs:
-            text = f"its streaming process (number {self.pid}) hangs: it sent nothing for {SILENT_S:g} s"
+            text = f"its streaming process (number {self.pid}) hangs, as it sent nothing for {SILENT_S:g} s"
             raise DeviceError(self._name, text)
 
     def close(self) -> None:
-        """Let the process ramp down and end; one that does not is killed. Legal in any state.
+        """Let the process ramp down and end, or kill it. Legal in any state.
 
         Raises:
             DeviceError: The transmitters may still be on.
@@ -198,7 +197,7 @@ class Link:
         self._wait(lambda: self._n_done >= task, float("inf"), what)
 
     def _wait(self, is_done: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Wait for something; raises DeviceError if the process ends or hangs, or it takes too long."""
+        """Wait for a condition. Raises DeviceError if the process ends or hangs, or it takes too long."""
 
         def poll(longest_s: float) -> bool | None:
             with self._news:

@@ -1,6 +1,6 @@
-"""Radios and their connections: what each carries, and whether it can shift the samples digitally.
+"""Radios, the rates of their connections, and whether they can shift the samples digitally.
 
-Figures and where they are from: docs/how-to/static-tweezers-soapy.md, "The connection".
+The figures and their sources are in docs/how-to/static-tweezers-soapy.md, "The connection".
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class KnownRadio(NamedTuple):
     bus: Bus
     """Its fastest connection."""
     most_hz: float | None = None
-    """Highest sample rate with two channels; None: as the connection allows."""
+    """Highest sample rate with two channels, None if the connection sets it."""
 
 
 _B2X0: Final = KnownRadio("a USRP B2x0", "usb3", 30.72e6)
@@ -57,12 +57,12 @@ def tunes_digitally(device: str) -> bool:
 
 
 def too_fast(device: str, bus: Bus | None, stream: str, rate_hz: float) -> tuple[str, float] | None:
-    """Why a radio cannot be sent two channels at a sample rate, and its highest; None if it can.
+    """Why a sample rate is too high for two channels of a radio, and the highest, None if it is not.
 
     Args:
         device: Arguments that open it.
-        bus: Its connection; None: the fastest that it has.
-        stream: Arguments of its stream; with ``WIRE=sc8`` a sample has 2 bytes instead of 4.
+        bus: Its connection, None for its fastest.
+        stream: Arguments of its stream. With ``WIRE=sc8`` a sample has 2 bytes instead of 4.
         rate_hz: Samples per second and channel.
     """
     arguments = read_arguments(device)

@@ -20,34 +20,34 @@ class SoapySettings(Settings):
     device: str = Field(
         default="driver=uhd",
         min_length=1,
-        description="what opens the radio, as in `SoapySDRUtil --find`; `simulated` for one that exists only "
-        "in software",
+        description="arguments that open it, as in `SoapySDRUtil --find`, or `simulated` for a radio "
+        "that exists only in software",
     )
     stream: str = Field(
         default="",
-        description="arguments of its stream, for example the size of its buffers: `SoapySDRUtil --probe`",
+        description="arguments of its stream, such as the size of its buffers (see `SoapySDRUtil --probe`)",
     )
     bus: Bus | None = Field(
-        default=None, description="its connection, for `labseq check`; none: the fastest that it has"
+        default=None, description="its connection, for `labseq check`, or none for its fastest"
     )
     row_channel: Channel = Field(default=0, description="output that drives the row axis")
     column_channel: Channel = Field(default=1, description="output that drives the column axis")
     sample_rate: Rate = Field(
         default=40e6,
-        description="samples per second; the tones may span 80 % of it around the local oscillator",
+        description="samples per second. The tones may span 80 % of it around the local oscillator",
     )
     bandwidth: Rate | None = Field(
-        default=None, description="of the radio's analog filters; none: as the radio chooses"
+        default=None, description="of the radio's analog filters, or none to let the radio choose"
     )
     local_oscillator: Rate | None = Field(
         default=None,
-        description="centre of the radio's band, for both outputs; none: a third of a site from the tone "
+        description="centre of the band of both outputs. With none, a third of a site from the tone "
         "in the middle, so that its leakage and the tones' images fall between the tweezers",
     )
     lo_offset: Frequency = Field(
         default=0.0,
-        description="moves the local oscillator away from there, to outside the tones; radios that can do so "
-        "shift the samples back, for others the tones must fit into the sample rate with it",
+        description="moves the local oscillator away from there, to outside the tones. Some radios "
+        "shift the samples back. With others the sample rate must cover the tones and this offset",
     )
     row_frequency: FrequencyComb = Field(default=FrequencyComb(), description="tones of the rows")
     column_frequency: FrequencyComb = Field(default=FrequencyComb(), description="tones of the columns")
@@ -55,12 +55,12 @@ class SoapySettings(Settings):
         default=1.0, description="how far a tone may be from its exact frequency"
     )
     row_gain: float | None = Field(
-        default=None, description="gain of the row output in dB; none: the lowest that it has"
+        default=None, description="gain of the row output in dB, or none for its lowest"
     )
-    column_gain: float | None = Field(default=None, description="the same of the column output")
+    column_gain: float | None = Field(default=None, description="the same for the column output")
     antenna: str = Field(default="", description="name of the connectors, if there are several")
     clock_source: str = Field(
-        default="", description="reference of the radio's clocks, for example `external`; none: its own"
+        default="", description="reference of the radio's clocks, such as `external`, or empty for its own"
     )
     max_depth: Annotated[float, Field(ge=1, allow_inf_nan=False)] = Field(
         default=1.0, description="greatest depth, as a fraction of the nominal depth"
@@ -76,29 +76,29 @@ class SoapySettings(Settings):
     max_disturbances: Annotated[int, Field(ge=0)] = Field(
         default=10,
         description="how often the radio may run out of samples, or miss a packet of them, in a minute while "
-        "the array is on; each time the shot is repeated, above it the run ends",
+        "the array is on. Each time the shot is repeated. Above this number the run ends",
     )
     after_run: Literal["off", "on"] = Field(
         default="off",
-        description="the light after a run that took all its shots: ramped down, or left on until the next "
+        description="the light after a run that took all its shots, ramped down or left on until the next "
         "labseq opens the radio (a run, `labseq devices`, `labseq safe`)",
     )
     patience: Annotated[Duration, Field(ge=0.2, le=3600)] = Field(
-        default=5.0, description="with `ramp_down`: how long labseq may be silent before it counts as hung"
+        default=5.0, description="with `ramp_down`, how long labseq may be silent before it counts as hung"
     )
 
     @property
     def is_simulated(self) -> bool:
-        """Whether the radio is a simulated one; its arguments may follow after a comma."""
+        """Whether the radio is simulated. Its arguments may follow after a comma."""
         return self.device.partition(",")[0] == "simulated"
 
     def identities(self) -> tuple[str, ...]:
-        """What only one process can use of it."""
+        """Names of the radio, which only one process can use."""
         arguments = sorted(part.strip() for part in self.device.split(","))
         return () if self.is_simulated else (f"radio {','.join(arguments)}",)
 
     def warnings(self) -> Iterator[tuple[tuple[str, ...], str, str]]:
-        """A sample rate that the radio or its connection cannot keep up with."""
+        """Warn of a sample rate that the radio or its connection cannot keep up with."""
         found = too_fast(self.device, self.bus, self.stream, self.sample_rate)
         if found is not None:
             why, most_hz = found

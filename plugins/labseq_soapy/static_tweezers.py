@@ -28,11 +28,11 @@ from labseq_soapy.settings import SoapySettings
 from labseq_soapy.tones import ArrayTones
 
 SHORTEST_RELEASE_S: Final = 1e-6
-"""Shortest release. The light of an AOD cannot be switched faster: sound crosses a beam of 4 mm in 6 us."""
+"""Shortest release. An AOD cannot switch light faster, since sound crosses a beam of 4 mm in 6 us."""
 LATENCY_S: Final = 30e-3
-"""From the call of a ramp or release to its start at the connectors: what the radio has buffered.
+"""Time from the call of a ramp or release to its start at the connectors, due to the radio's buffer.
 
-Measured: 26 to 34 ms with the simulated radio, which buffers 20 ms. A real one says how much once open.
+Measured 26 to 34 ms with the simulated radio, which buffers 20 ms. A real radio tells it once open.
 """
 MINUTE_S: Final = 60.0
 DISTURBANCES: Final = {
@@ -40,10 +40,10 @@ DISTURBANCES: Final = {
     "sequence_errors": "missed packets",
     "late_packets": "missed packets",
 }
-"""Error that the radio reports -> what it did."""
-APART: Final = "it had no timed start, or too late: rows and columns may be some microseconds apart"
+"""Error that the radio reports -> its description."""
+APART: Final = "its start was late or not timed, so rows and columns may be some microseconds apart"
 NO_REAL_TIME: Final = (
-    "the streaming process has no real-time priority ({}): a busy computer may let the radio run out of "
+    "the streaming process has no real-time priority ({}), so on a busy computer the radio may run out of "
     "samples; under Linux add '@GROUP - rtprio 99' with your group to /etc/security/limits.conf, log in again"
 )
 
@@ -63,7 +63,7 @@ class SoapyStaticTweezers(StaticTweezers):
         context: Name, grid, clock, simulation, calibrated amplitudes.
 
     Attributes:
-        radio: How the streaming process gets to the radio.
+        radio: Access of the streaming process to the radio.
 
     Raises:
         LimitError: The tones span more than 80 % of the sample rate, or no loop holds them all.
@@ -76,7 +76,7 @@ class SoapyStaticTweezers(StaticTweezers):
         self._tones = ArrayTones(self._name, settings, context.grid.shape)
         self._calibrated = calibrated_amplitudes(context)
         self._amplitudes: Amplitudes | None = None
-        self._depth: float | None = 0.0  # None: a ramp was interrupted
+        self._depth: float | None = 0.0  # None after an interrupted ramp
         self._seen: Mapping[str, int] = {}  # errors while the array was on
         self._recent: deque[tuple[float, int]] = deque()  # when the radio reported how many errors
         self._link: Link | None = None
@@ -90,7 +90,7 @@ class SoapyStaticTweezers(StaticTweezers):
         return TweezersFacts(1 / self._settings.sample_rate, SHORTEST_RELEASE_S, LATENCY_S)
 
     def open(self) -> None:
-        """Open the radio and stream silence; no effect if it is open.
+        """Open the radio and stream silence. No effect if it is open.
 
         Raises:
             DeviceError: No library, no such radio, another program uses it, or it refuses a setting.
@@ -109,7 +109,7 @@ class SoapyStaticTweezers(StaticTweezers):
             raise
 
     def close(self) -> None:
-        """Ramp down and close the radio; legal in any state.
+        """Ramp down and close the radio. Legal in any state.
 
         Raises:
             DeviceError: Its transmitters may still be on.
@@ -117,7 +117,7 @@ class SoapyStaticTweezers(StaticTweezers):
         self._disconnect()
 
     def load(self, amplitudes: Amplitudes | None) -> None:
-        """Set the tone amplitudes of the rows (n_rows,) and columns (n_cols,); None: as calibrated.
+        """Set the tone amplitudes of the rows (n_rows,) and columns (n_cols,), None for the calibrated ones.
 
         While the array is on they are faded in.
 
@@ -128,7 +128,7 @@ class SoapyStaticTweezers(StaticTweezers):
         self._load(amplitudes)
 
     def start(self) -> None:
-        """Ramp the array to its nominal depth; no effect if it is there."""
+        """Ramp the array to its nominal depth. No effect if it is there."""
         self._checked()
         if not self._is_loaded:
             self._load(self._amplitudes)
@@ -136,7 +136,7 @@ class SoapyStaticTweezers(StaticTweezers):
             self._ramp(1.0, self._settings.switch)
 
     def ramp(self, depth: float, duration_s: float) -> None:
-        """Change the depth linearly; returns when the ramp has ended at the connectors.
+        """Change the depth linearly, and return when the ramp has ended at the connectors.
 
         Raises:
             LimitError: A depth or duration that the array cannot have.
@@ -148,7 +148,7 @@ class SoapyStaticTweezers(StaticTweezers):
         self._ramp(depth, duration_s)
 
     def release(self, duration_s: float) -> float:
-        """Play silence, then the tones again; returns when they are at the connectors.
+        """Play silence, then the tones again, and return when they are at the connectors.
 
         The streaming process does both for one command. A ramp that comes meanwhile starts from the dark.
 
@@ -170,11 +170,11 @@ class SoapyStaticTweezers(StaticTweezers):
         return n_samples / rate_hz
 
     def safe_state(self) -> None:
-        """Ramp the array down; where the stream is dead, switch the radio's transmitters off.
+        """Ramp the array down. If the stream is dead, switch the radio's transmitters off.
 
         Raises:
-            DeviceError: The process hangs; it was killed, and the transmitters were switched off. Or they may
-                still be on.
+            DeviceError: The process hung and was killed, and the transmitters were switched off or may still
+                be on.
         """
         link = self._link
         if link is None or self._depth == 0.0:
@@ -210,13 +210,13 @@ class SoapyStaticTweezers(StaticTweezers):
         return True
 
     def emergency(self) -> Emergency | None:
-        """The streaming process is ended, and closes the radio; None if it is not open."""
+        """A script that ends the streaming process, which closes the radio. None if it is not open."""
         if self._link is None:
             return None
         return Emergency(Path(__file__).with_name("emergency.py"), self._link.emergency_arguments())
 
     def check_interlocks(self) -> None:
-        """Check that the stream is alive; called at the start of each shot and before each pick-up."""
+        """Check that the stream is alive, at the start of each shot and before each pick-up."""
         self._checked()
 
     def self_test(self) -> None:
@@ -238,16 +238,16 @@ class SoapyStaticTweezers(StaticTweezers):
         hint = "can it tune to `local_oscillator`?"
         if REF_LOCKED in found:
             hint = f"is the reference of `clock_source: {source}` connected, and of the right frequency?"
-        raise DeviceError(self._name, f"the radio is not locked ({', '.join(found)}): {hint}")
+        raise DeviceError(self._name, f"the radio is not locked ({', '.join(found)}); {hint}")
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
-        """Those that SoapySDR and the radio's module report; no real radio was tried."""
+        """Versions that SoapySDR and the radio's module report. No real radio was tried."""
         radio = {} if self._facts is None else self._facts.radio
         found = {name: (value, "") for name, value in radio.items() if "version" in name}
         return found | ({"SoapySDR": (radio["SoapySDR"], "0.8.1-3")} if "SoapySDR" in radio else {})
 
     def describe(self) -> Mapping[str, Any]:
-        """Settings, depth, amplitudes; once opened, also the radio, the loop and underflows."""
+        """Settings, depth, amplitudes, and once opened also the radio, the loop and underflows."""
         given = self._amplitudes
         amplitudes = (
             "calibrated" if given is None else {"row": given[0].tolist(), "column": given[1].tolist()}
@@ -337,7 +337,7 @@ class SoapyStaticTweezers(StaticTweezers):
         if n_recent > limit:
             text = f"{text}, and had {n_recent} disturbances within a minute"
             raise DeviceError(self._name, f"{text}; max_disturbances allows {limit}")
-        raise TransientError(f"{text}: atoms may be lost", self._name)
+        raise TransientError(f"{text}, so atoms may be lost", self._name)
 
     def _n_recent(self, n_new: int) -> int:
         """Errors within the last minute, with new ones."""

@@ -1,7 +1,7 @@
-"""The tones of the array: local oscillator, length of the loop, phases, and the samples of the loop.
+"""The tones of the array, with local oscillator, length of the loop, phases, and the samples of the loop.
 
-Tones are complex: at baseband each is ``a exp(i (2 pi f t + phase))``, where f is its distance from the
-local oscillator. The functions are pure; :class:`ArrayTones` applies them to both axes of one radio.
+Tones are complex. At baseband each is ``a exp(i (2 pi f t + phase))``, where f is its distance from the
+local oscillator. The functions are pure. :class:`ArrayTones` applies them to both axes of one radio.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ TUNING_ERROR: Final = 0.01
 """How far the local oscillators may be from the requested frequency, as a fraction of the sample rate."""
 
 USABLE: Final = 0.8
-"""Part of the sample rate that tones may span: the radio's filters attenuate the rest."""
+"""Part of the sample rate that tones may span. The radio's filters attenuate the rest."""
 
 LONGEST: Final = 1 << 23
-"""Longest loop in samples: 128 MiB for both channels."""
+"""Longest loop in samples, 128 MiB for both channels."""
 
 _CHUNK: Final = 1 << 18
 _ROUNDS: Final = 400
@@ -152,9 +152,9 @@ def axis_loop(offsets_hz: Floats, n_samples: int, rate_hz: float) -> AxisLoop:
 
 
 def low_crest_phases(frequency_hz: Floats) -> Floats:
-    """Phases of equal tones for a low crest factor of their complex sum; the same for the same tones.
+    """Phases of equal tones for a low crest factor of their complex sum, the same for the same tones.
 
-    Start from Schroeder's phases (IEEE Trans. Inf. Theory 16, 85, 1970); then repeatedly clip the sum and
+    Start from Schroeder's phases (IEEE Trans. Inf. Theory 16, 85, 1970). Then repeatedly clip the sum and
     take the phases of the result (van der Ouderaa et al., IEEE Trans. Instrum. Meas. 37, 145, 1988).
 
     Args:
@@ -182,14 +182,14 @@ def low_crest_phases(frequency_hz: Floats) -> Floats:
 
 
 def crest_factor(samples: NDArray[np.complex64]) -> float:
-    """Ratio of the highest to the r.m.s. magnitude; 0 for silence."""
+    """Ratio of the highest to the r.m.s. magnitude, 0 for silence."""
     size = np.abs(samples)
     rms = float(np.sqrt(np.mean(np.square(size, dtype=np.float64))))
     return float(size.max()) / rms if rms > 0.0 else 0.0
 
 
 def _times_s(frequency_hz: Floats) -> Floats:
-    """Times at which peaks are looked for: one period of a comb, or four beats of other tones."""
+    """Times at which to look for peaks, one period of a comb or four beats of other tones."""
     spacings = np.diff(np.sort(frequency_hz))
     is_comb = np.ptp(spacings) < 1e-3 * spacings.min()
     n_beats = 1 if is_comb else 4
@@ -211,14 +211,14 @@ class ArrayTones:
 
     Args:
         name: Name of the device, for messages.
-        settings: Of the driver.
+        settings: Settings of the driver.
         shape: (n_rows, n_cols).
 
     Attributes:
         tones_hz: Tones of the rows and of the columns.
         oscillator_hz: Frequency requested for the local oscillators.
-        crest_factor: Of the complex sums of the rows' and the columns' tones, in the last loop.
-        loops: The tones on the grid of the loop; none before :meth:`tune`.
+        crest_factor: Crest factor of the complex sums of the rows' and the columns' tones, in the last loop.
+        loops: The tones on the grid of the loop, none before :meth:`tune`.
 
     Raises:
         LimitError: The tones span more than 80 % of the sample rate, no loop holds them all, or the offset of
@@ -241,18 +241,18 @@ class ArrayTones:
         """Fit the loops to the sample rate and local oscillators that the radio really has.
 
         Raises:
-            DeviceError: They are not the requested ones.
+            DeviceError: They are not as requested.
             LimitError: No loop holds all tones.
         """
         wanted_hz = self._settings.sample_rate
         if abs(facts.rate_hz - wanted_hz) > RATE_ERROR * wanted_hz:
-            text = f"the radio makes {facts.rate_hz:.10g} samples per second; expected {wanted_hz:.10g}"
-            raise DeviceError(self._name, f"{text}: choose a sample_rate that it has")
+            text = f"the radio makes {facts.rate_hz:.10g} samples per second, not {wanted_hz:.10g}"
+            raise DeviceError(self._name, f"{text}; choose a sample_rate that it has")
         expected_hz = self.oscillator_hz + self._settings.lo_offset
         for found_hz in facts.oscillator_hz:
             if abs(found_hz - expected_hz) > TUNING_ERROR * wanted_hz:
                 text = f"the radio tuned its local oscillator to {found_hz:.10g} Hz"
-                raise DeviceError(self._name, f"{text}; expected {expected_hz:.10g} Hz: see its range")
+                raise DeviceError(self._name, f"{text}, not {expected_hz:.10g} Hz; check its tuning range")
         n_samples = self._n_samples(facts.rate_hz, facts.zero_hz)
         self.loops = tuple(
             axis_loop(tones_hz - zero_hz, n_samples, facts.rate_hz)
@@ -263,7 +263,7 @@ class ArrayTones:
         """One loop of both axes, in the order of their channels, float32 (2, 2 n), I and Q in turn.
 
         Args:
-            amplitudes: Of the rows (n_rows,) and columns (n_cols,), fractions of full scale.
+            amplitudes: Amplitudes of the rows (n_rows,) and columns (n_cols,), fractions of full scale.
 
         Raises:
             LimitError: Not one amplitude for each tone, a bad one, or their sum exceeds full scale.

@@ -1,8 +1,8 @@
-"""An open card: registers that are read back, transfers, and errors as labseq raises them.
+"""An open card, whose registers are read back, with its transfers and labseq's errors.
 
-The lower part of the vendor's package ``spcm``, ``spcm_core``, has the functions and registers of the driver
-library, as the manual has them. The classes on top do not check what the card really set, and import
-matplotlib.
+It uses ``spcm_core``, the lower part of the vendor's package ``spcm``, with the functions and registers of
+the driver library as the manual has them. The classes on top do not check the card's real settings, and they
+import matplotlib.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ NOT_LOCKED: Final = (
 
 
 class Buffer:
-    """Memory from which the card fetches samples; it grows and is kept.
+    """Memory from which the card fetches samples. It grows and is kept.
 
     The driver library wants it to start at a page, as ``mmap`` does.
     """
@@ -43,7 +43,7 @@ class Buffer:
         self._memory = mmap.mmap(-1, mmap.PAGESIZE)
 
     def reserve(self, n_samples: int) -> NDArray[np.int16]:
-        """Room for samples of both outputs, int16 (n_samples, 2); the old content is lost."""
+        """Room for samples of both outputs, int16 (n_samples, 2). The old content is lost."""
         n_bytes = 4 * n_samples
         if len(self._memory) < n_bytes:
             self._memory = mmap.mmap(-1, -(-n_bytes // mmap.PAGESIZE) * mmap.PAGESIZE)
@@ -55,7 +55,7 @@ class CallLock:
 
     Attributes:
         word: int64 (1,), 1 during a call. A loop in a thread of its own takes it for each of its calls by
-            :func:`labseq_spcm.kernels.take`; a step that the simulated card calls within a call does not.
+            :func:`labseq_spcm.kernels.take`. A step that the simulated card calls within a call does not.
     """
 
     def __init__(self) -> None:
@@ -88,7 +88,7 @@ class AwgCard:
         spcm: The vendor's package.
         library: Where the card comes from.
         n_outputs: How many outputs the card has.
-        outputs: Those that are used, in ascending order.
+        outputs: The outputs in use, in ascending order.
         lock: For calls of the driver library.
 
     Raises:
@@ -105,26 +105,26 @@ class AwgCard:
         self.n_outputs = 2
         self.outputs: tuple[int, ...] = (0, 1)
         device_name = library.connect()
-        # every slot for the card reaches 0.5 GB/s; a NETBOX has Gigabit Ethernet
+        # every slot for the card reaches 0.5 GB/s, and a NETBOX has Gigabit Ethernet
         self._slowest_bytes_per_s = 50e6 if device_name.upper().startswith("TCPIP") else 0.5e9
         self._handle: Any = spcm.spcm_hOpen(ctypes.create_string_buffer(device_name.encode()))
         if not self._handle:
             reason = self.clear_error()
             library.disconnect()
-            hint = "see its name in Spectrum's Control Center, and close what else uses it"
+            hint = "look up its name in Spectrum's Control Center, and close other programs that use it"
             raise DeviceError(name, f"cannot open the card '{device_name}': {reason}; {hint}")
 
     def close(self) -> None:
-        """Close the card; what it does goes on."""
+        """Close the card, which goes on playing."""
         with self.lock:
             self.spcm.spcm_vClose(self._handle)
         self.library.disconnect()
 
     def clear_error(self, code: int = 0) -> str:
-        """Read the pending error: until then the driver library refuses every other call.
+        """Read the pending error, which the driver library requires before any other call.
 
         Args:
-            code: What the refused function returned; named if the library has no text for it.
+            code: Return value of the refused function, named if the library has no text for it.
         """
         spcm = self.spcm
         buffer = ctypes.create_string_buffer(spcm.ERRORTEXTLEN)
@@ -142,9 +142,9 @@ class AwgCard:
         """Call a function of the driver library, and raise the error that it returns.
 
         Args:
-            action: What is being done, for messages.
-            function: Of ``spcm_core``.
-            arguments: Those after the handle.
+            action: Name of the action, for messages.
+            function: Function of ``spcm_core``.
+            arguments: Its arguments after the handle.
         """
         with self.lock:  # until the error is read, the library refuses what other threads call
             code = function(self._handle, *arguments)
@@ -185,7 +185,7 @@ class AwgCard:
 
     @property
     def ran_dry(self) -> bool:
-        """Whether a stream has ended for want of samples; the manual does not say that it is ready then."""
+        """Whether a stream ended for want of samples. The manual does not say that the card is ready then."""
         return bool(self.status & self.spcm.M2STAT_DATA_OVERRUN)
 
     @property
@@ -205,7 +205,7 @@ class AwgCard:
         self._call(f"{name} = {value}", self.spcm.spcm_dwSetParam_i64, register, value)
 
     def set(self, register: int, value: int, name: str, tolerance: int = 0) -> int:
-        """Write a register and read it back: the card rounds some values and snaps others.
+        """Write a register and read it back, since the card rounds some values and snaps others.
 
         Args:
             register: Its number.
@@ -227,11 +227,11 @@ class AwgCard:
         self._call(action, self.spcm.spcm_dwSetParam_i64, self.spcm.SPC_M2CMD, command)
 
     def write_setup(self) -> None:
-        """Send the settings to the card: until then, or until the start, only its driver has them."""
+        """Send the settings to the card. Before that, or the start, only its driver has them."""
         self.command(self.spcm.M2CMD_CARD_WRITESETUP, "writing the set-up")
 
     def define_transfer(self, frames: NDArray[np.int16], notify_bytes: int = 0) -> None:
-        """Name the samples of the next transfer; the array must live until the transfer is over."""
+        """Name the samples of the next transfer. The array must live until the transfer is over."""
         spcm, address = self.spcm, ctypes.c_void_p(frames.ctypes.data)
         kind, direction = spcm.SPCM_BUF_DATA, spcm.SPCM_DIR_PCTOCARD
         buffer = kind, direction, notify_bytes, address, 0, frames.nbytes
@@ -243,7 +243,7 @@ class AwgCard:
         The command is not used, because it cannot be interrupted.
 
         Args:
-            handed_bytes: What the card may fetch, for the message.
+            handed_bytes: Bytes that the card may fetch, for the message.
 
         Raises:
             DeviceTimeoutError: It has not within ``TRANSFER_TIMEOUT_S``.
@@ -258,14 +258,14 @@ class AwgCard:
     def not_fetched(self, fetched_bytes: int, expected_bytes: int) -> DeviceTimeoutError:
         """The error of a stream that cannot be started."""
         text = f"the card fetched {fetched_bytes} of {expected_bytes} bytes, and was not started"
-        hint = "use mode: sequence, and see the card's bus in Spectrum's Control Center"
+        hint = "use `mode: sequence`, and check the card's bus in Spectrum's Control Center"
         return DeviceTimeoutError(self.name, f"{text}; {hint}", TRANSFER_TIMEOUT_S)
 
     def upload(self, frames: NDArray[np.int16], poll_s: float = POLL_S) -> float:
         """Transfer samples to the on-board memory, and wait until they have arrived.
 
         Returns:
-            How long that took, in seconds, without the naming of the buffer, which pins its pages.
+            Time that this took, in seconds, without naming the buffer, which pins its pages.
 
         Raises:
             DeviceTimeoutError: They take too long.
@@ -275,7 +275,7 @@ class AwgCard:
         return self.clock.now() - start_s
 
     def begin_upload(self, frames: NDArray[np.int16]) -> float:
-        """Begin to transfer samples to the on-board memory; the array must live until they have arrived.
+        """Begin to transfer samples to the on-board memory. The array must live until they have arrived.
 
         Returns:
             When it began, without the naming of the buffer.
@@ -299,7 +299,7 @@ class AwgCard:
             self.clock.sleep(poll_s)
 
     def stop(self) -> None:
-        """Stop playing and transferring; no effect if it does neither."""
+        """Stop playing and transferring. No effect if the card does neither."""
         spcm = self.spcm
         self.command(spcm.M2CMD_CARD_STOP | spcm.M2CMD_DATA_STOPDMA, "stop")
         self._call("releasing the transfer buffer", spcm.spcm_dwInvalidateBuf, spcm.SPCM_BUF_DATA)

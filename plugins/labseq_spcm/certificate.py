@@ -1,7 +1,7 @@
-"""The certificate of the mode ``stream``: a first contact with this card on this computer that went well.
+"""The certificate of the mode ``stream``, a successful first contact with this card on this computer.
 
-What the mode assumes of the card only the card can prove: that samples may be changed after they were handed
-over, that its reports are not late, that the bus is fast enough.
+The mode assumes that samples may be changed after they were handed over, that the card's reports are not
+late, and that the bus is fast enough. Only the card can prove this.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from labseq_spcm.settings import SpcmSettings
 
 
 def permitted(settings: SpcmSettings) -> tuple[SpcmSettings, str]:
-    """The settings with the default mode in place of ``stream``, if the card may not; and why."""
+    """The settings, with the default mode if the card may not ``stream``, and why it may not."""
     reason = missing_certificate(settings) if settings.mode == "stream" else ""
     if not reason:
         return settings, ""
@@ -25,19 +25,19 @@ def permitted(settings: SpcmSettings) -> tuple[SpcmSettings, str]:
 
 
 def missing_certificate(settings: SpcmSettings) -> str:
-    """Why the card may not stream with these settings; "" if it may, or if it exists in software only."""
+    """Why the card may not stream with these settings, "" if it may or is simulated."""
     if settings.card.startswith(SIMULATED):
         return ""
     if not settings.serial:
         return "`serial` does not say which card it is"
     path = certificate_path(settings)
     if not path.exists():
-        return f"there is none of the card {settings.serial}"
+        return f"there is none for the card {settings.serial}"
     try:
         content = read_contact(path)
         check_belongs(content, {}, path)
     except ConfigError as error:
-        return f"of the card {settings.serial} it cannot be used: {error.problems[0].what}"
+        return f"the certificate of the card {settings.serial} cannot be used: {error.problems[0].what}"
     verdict = content["verdict"]
     if not verdict["stream"]:
         return f"its first contact says: {verdict['reason']}"
@@ -46,19 +46,19 @@ def missing_certificate(settings: SpcmSettings) -> str:
             measured, present = (
                 f"{n / 1e6:.9g} MHz" if key == "sample_rate" else n for n in (value, present)
             )
-            return f"its first contact was with {key} {measured}; the profile has {present}"
+            return f"its first contact was with {key} {measured}, but the profile has {present}"
     return ""
 
 
 def check_certificate(settings: SpcmSettings, card: Mapping[str, str]) -> None:
-    """Check that the certificate is of the card that is open, and of its present software.
+    """Check that the certificate is for the open card and its present software.
 
     Args:
-        settings: Those of the driver.
+        settings: Settings of the driver.
         card: See :func:`labseq_spcm.set_up.identity`.
 
     Raises:
-        ConfigError: It is of another card, driver or firmware.
+        ConfigError: It is for another card, driver or firmware.
     """
     if not settings.card.startswith(SIMULATED):
         path = certificate_path(settings)

@@ -1,9 +1,9 @@
 """Switches a Spectrum card off from another process, with the vendor's library alone.
 
 labseq's watchdog loads this file by its path after the run that used the card has died. It needs nothing
-but Python's standard library. The order: stop, so that the outputs go to their stop level of 0 V; lowest
-amplitude; output relays open, which takes effect with WRITESETUP only; reset of the card, which
-disables its outputs even if the library, new in this process, should take them for disabled already.
+but Python's standard library. It stops the card, so that the outputs go to their stop level of 0 V, and sets
+the lowest amplitude. Then it opens the output relays, which only takes effect with WRITESETUP. Last it resets
+the card, which disables the outputs even if the library, new in this process, takes them for disabled.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ M2STAT_CARD_READY = 0x4
 
 LOWEST_MV = 80
 HELD_S = 2.0
-"""How long another process may still hold the card, in seconds: one that dies gives it back by then."""
+"""How long another process may still hold the card, in seconds. A dying process gives it back by then."""
 
 
 class EmergencyError(Exception):
-    """The card could not be switched off; the text says why."""
+    """The card could not be switched off. The text says why."""
 
 
 def prepare(library: str, card: str, n_outputs: int = 2) -> None:
-    """Load the driver library; does not touch the card.
+    """Load the driver library without touching the card.
 
     Raises:
         EmergencyError: Wrong arguments, or there is no such library.
@@ -43,7 +43,7 @@ def prepare(library: str, card: str, n_outputs: int = 2) -> None:
 
 
 def off(library: str, card: str, n_outputs: int = 2) -> str:
-    """Stop the card, disable its outputs, and close it; a card that is off stays off.
+    """Stop the card, disable its outputs, and close it. A card that is off stays off.
 
     Args:
         library: The driver library.
@@ -54,7 +54,7 @@ def off(library: str, card: str, n_outputs: int = 2) -> str:
         What was done.
 
     Raises:
-        EmergencyError: The card cannot be opened, or refuses; the text is the driver library's.
+        EmergencyError: The card cannot be opened, or refuses. The text is the driver library's.
     """
     prepare(library, card, n_outputs)
     device = _Card(load(library), card, n_outputs)
@@ -101,7 +101,7 @@ class _Card:
         self._handle = handle
 
     def switch_off(self) -> str:
-        """All steps, also after one that was refused; then check that the card took them."""
+        """Do all steps, even after a refused one, then check that the card took them."""
         steps: list[tuple[int, int, str]] = [
             (SPC_M2CMD, M2CMD_CARD_STOP | M2CMD_DATA_STOPDMA, "stop"),
             *(
@@ -114,7 +114,7 @@ class _Card:
         ]
         refused: dict[str, str] = {}
         for register, value, step in steps:
-            # once more after an error: it may be one from before, which blocks the library until it is read
+            # try again after an error, which may be an earlier one that blocked the library until it was read
             if self._write(register, value) and (reason := self._write(register, value)):
                 refused[step] = reason
         reasons = "; ".join(f"{step}: {reason}" for step, reason in refused.items())
@@ -135,7 +135,7 @@ class _Card:
         self._library.spcm_vClose(self._handle)
 
     def _write(self, register: int, value: int) -> str:
-        """Write a register; returns the reason for which it was refused."""
+        """Write a register, and return why it was refused."""
         if self._library.spcm_dwSetParam_i32(self._handle, register, value):
             return _error(self._library, self._handle)
         return ""
@@ -148,7 +148,7 @@ class _Card:
 
 
 def _error(library: Any, handle: int | None) -> str:
-    """The pending error's text; reading it unlocks the library."""
+    """The pending error's text. Reading it unlocks the library."""
     text = ctypes.create_string_buffer(256)  # the driver library writes at most 200 characters
     code = library.spcm_dwGetErrorInfo_i32(handle, None, None, ctypes.addressof(text))
     return (text.value.decode(errors="replace").strip().splitlines() or [f"error {code:#x}"])[0]

@@ -1,4 +1,4 @@
-"""The first contact with a Spectrum card: the steps, in their order."""
+"""The steps of the first contact with a Spectrum card, in their order."""
 
 from __future__ import annotations
 
@@ -77,42 +77,42 @@ def _steps(bench: Bench, full_scale: str) -> Iterator[ContactStep]:
     relays = "outputs at 0 V, their relays close for a moment"
     at_80_mv = "outputs on at 80 mV into 50 Ohm"
     load = "both outputs to 50 Ohm inputs of the oscilloscope, no amplifiers"
-    yield step("identity", f"reads what the card is and can do; {OFF}", 10, card.identity)
-    yield step("times", f"times resets, starts and transfers; {relays}", 30, card.times)
-    yield step("positions", f"hands silence over and reads positions; {OFF}", 20, transfer.positions)
-    yield step("write_speed", f"writes to the card at several notify sizes; {OFF}", 120, transfer.write_speed)
-    yield step("lag", f"times reports, also on a busy computer; {OFF}", 60, transfer.lag)
-    yield step("sustained", f"plays silence at the sample rate for 1 s; {OFF}", 30, transfer.sustained)
-    yield step("starve", f"lets the card run dry, and starts it again; {OFF}", 20, transfer.starve)
-    yield step("threads", f"calls the library from two threads at once; {OFF}", 20, card.threads)
-    second = f"kills a second process that plays, and stops the card from a third; {OFF}"
+    yield step("identity", f"reads what the card is and can do ({OFF})", 10, card.identity)
+    yield step("times", f"times resets, starts and transfers ({relays})", 30, card.times)
+    yield step("positions", f"hands silence over and reads positions ({OFF})", 20, transfer.positions)
+    yield step("write_speed", f"writes to the card at many notify sizes ({OFF})", 120, transfer.write_speed)
+    yield step("lag", f"times reports, also on a busy computer ({OFF})", 60, transfer.lag)
+    yield step("sustained", f"plays silence at the sample rate for 1 s ({OFF})", 30, transfer.sustained)
+    yield step("starve", f"lets the card run dry, and starts it again ({OFF})", 20, transfer.starve)
+    yield step("threads", f"calls the library from two threads at once ({OFF})", 20, card.threads)
+    second = f"kills a second process that plays, and stops the card from a third ({OFF})"
     yield step("second_process", second, 60, card.second_process)
-    yield step("dds", f"reads what the option DDS offers; {OFF}", 10, card.dds)
+    yield step("dds", f"reads what the option DDS offers ({OFF})", 10, card.dds)
     yield step(
-        "reference", f"makes rates from an external 10 MHz reference; {OFF}", 30, card.reference,
+        "reference", f"makes rates from an external 10 MHz reference ({OFF})", 30, card.reference,
         needs="reference", prepare="10 MHz to the clock input",
     )  # fmt: skip
     yield step(
-        "relay_steps", f"closes and opens the output relays five times; {relays}", 10, scope.relay_steps,
-        needs="scope", prepare=f"{load}; 20 mV per division, 1 ms per division, single shot",
+        "relay_steps", f"closes and opens the output relays five times ({relays})", 10, scope.relay_steps,
+        needs="scope", prepare=f"{load}, 20 mV per division, 1 ms per division, single shot",
         readings=scope.RELAYS,
     )  # fmt: skip
     yield step(
-        "overwrite", f"writes 20 bursts over silence, 10 ms apart; {at_80_mv}", 20, scope.overwrite,
-        needs="scope", prepare=f"{load}; 50 ms per division with peak detection, single shot at 40 mV",
+        "overwrite", f"writes 20 bursts over silence, 10 ms apart ({at_80_mv})", 20, scope.overwrite,
+        needs="scope", prepare=f"{load}, 50 ms per division with peak detection, single shot at 40 mV",
         readings=scope.OVERWRITE,
     )  # fmt: skip
     yield step(
-        "trigger", f"plays a pulse at each edge at Ext0 for 10 s; {at_80_mv}", 30, scope.trigger,
-        needs="scope", prepare=f"{load}; a pulse generator at 100 Hz to Ext0 and to the oscilloscope's "
-        "trigger; infinite persistence", readings=scope.TRIGGER,
+        "trigger", f"plays a pulse at each edge at Ext0 for 10 s ({at_80_mv})", 30, scope.trigger,
+        needs="scope", prepare=f"{load}, a pulse generator at 100 Hz to Ext0 and to the oscilloscope's "
+        "trigger, infinite persistence", readings=scope.TRIGGER,
     )  # fmt: skip
     yield step(
-        "killed", f"kills a process that plays a tone, stops it 0.5 s later; {at_80_mv}", 60, scope.killed,
-        needs="scope", prepare=f"{load}; 200 ms per division, single shot at 40 mV", readings=scope.KILL,
+        "killed", f"kills a process that plays a tone, stops it 0.5 s later ({at_80_mv})", 60, scope.killed,
+        needs="scope", prepare=f"{load}, 200 ms per division, single shot at 40 mV", readings=scope.KILL,
     )  # fmt: skip
     yield step(
         "ramp", f"plays moves at {full_scale} into 50 Ohm, and has the driver make the card safe", 60,
-        scope.ramp, needs="scope", prepare=f"{load}; 500 us per division, single shot, before the end of "
+        scope.ramp, needs="scope", prepare=f"{load}, 500 us per division, single shot, before the end of "
         "the tones", readings=scope.RAMP,
     )  # fmt: skip

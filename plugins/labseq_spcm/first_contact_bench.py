@@ -1,4 +1,4 @@
-"""The card on the bench: opened for a first contact, with a stopwatch, and transfers of silence."""
+"""The card while it is opened for a first contact, with a stopwatch and transfers of silence."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from labseq_spcm.set_up import NEXT_OUTPUT, check_type, identity, set_up, switch
 from labseq_spcm.settings import SpcmSettings
 
 LOWEST_MV: Final = ANY.amplitude_mv[0]
-"""The only amplitude of a first contact, but for the step that tries the safe ramp."""
+"""The only amplitude of a first contact, except in the step that tries the safe ramp."""
 Driver = TypeVar("Driver", bound=MobileTweezers)
 
 
@@ -56,7 +56,7 @@ class Bench:
         return self._card
 
     def open(self) -> Mapping[str, str]:
-        """Open the card; returns serial number, model, driver and firmware."""
+        """Open the card, and return serial number, model, driver and firmware."""
         if self._card is None:
             card = self._card = AwgCard(self.name, self.library, self._clock)
             try:
@@ -68,18 +68,18 @@ class Bench:
         return identity(self.card)
 
     def emergency(self, script: Path) -> Emergency | None:
-        """A script that another process can run on the card; None for one that dies with this process."""
+        """A script that another process can run on the card, None for a card that dies with this process."""
         return self.library.emergency(script, self._n_outputs)
 
     def close(self) -> None:
-        """Close the card; what it does goes on."""
+        """Close the card, which goes on playing."""
         card, self._card = self._card, None
         if card is not None:
             card.close()
 
     @contextmanager
     def lent(self) -> Generator[None]:
-        """Leave the card to another process, which the block must end; afterwards call :meth:`open_again`."""
+        """Leave the card to another process, which the block must end. Then call :meth:`open_again`."""
         self.close()
         self._is_lent = True
         yield
@@ -100,7 +100,7 @@ class Bench:
         """Open the card as soon as the system has closed it for the other process.
 
         Raises:
-            DeviceError: It cannot be opened in time; with the last reason.
+            DeviceError: It cannot be opened in time, with the last reason.
         """
         until_s = self.now() + within_s
         while True:
@@ -115,7 +115,7 @@ class Bench:
                 return
 
     def safe_state(self) -> None:
-        """Stop, open the relays, and reset; all of it also after a step that was refused.
+        """Stop, open the relays, and reset, all of it even after a refused step.
 
         Raises:
             DeviceError: The card refused its reset, or is not off after it.
@@ -127,7 +127,7 @@ class Bench:
         if (card := self._card) is None:
             return
         with suppress(DeviceError):
-            card.clear_error()  # perhaps of an earlier call, which has locked the library
+            card.clear_error()  # an earlier call may have locked the library
         for step in (
             card.stop,
             *(partial(switch_output, card, output, on=False) for output in range(card.n_outputs)),
@@ -150,15 +150,15 @@ class Bench:
     # Time
 
     def now(self) -> float:
-        """Time in seconds; on a real clock with the finest resolution that the computer has."""
+        """Time in seconds, on a real clock with the finest resolution of the computer."""
         return self._clock.now() if self._clock.virtual else time.perf_counter()
 
     def pause(self, duration_s: float) -> None:
-        """Wait; obeys a request to stop."""
+        """Wait, unless a stop is requested."""
         self._clock.sleep(duration_s)
 
     def look_again(self, poll_s: float = 2e-6) -> None:
-        """Pass the time between two looks at a register; on a real clock the read takes long enough."""
+        """Pass the time between two looks at a register. On a real clock the read takes long enough."""
         if self._clock.virtual:
             self._clock.sleep(poll_s)
         else:
@@ -171,10 +171,10 @@ class Bench:
         return self.now() - start_s
 
     def until(self, condition: Callable[[], bool], limit_s: float, what: str, poll_s: float = 2e-6) -> float:
-        """Wait for a condition, looking all the time; returns how long that took, in seconds.
+        """Wait for a condition, looking all the time, and return how long that took, in seconds.
 
         Raises:
-            DeviceTimeoutError: It is not met within the limit; the message says what was waited for.
+            DeviceTimeoutError: It is not met within the limit. The message contains ``what``.
         """
         start_s = self.now()
         while not condition():
@@ -184,9 +184,9 @@ class Bench:
         return self.now() - start_s
 
     def last_missed(self, condition: Callable[[], bool], limit_s: float, what: str) -> float:
-        """Wait for a condition; returns after which time it was certainly not met yet, in seconds.
+        """Wait for a condition, and return the time of the last look that did not find it, in seconds.
 
-        The look that finds it met may come much later, because the computer was busy with something else.
+        The look that finds it may come much later, because the computer was busy with something else.
         """
         missed_s, start_s = list[float](), self.now()
 
@@ -203,14 +203,14 @@ class Bench:
     # The card
 
     def read_if_known(self, register: int) -> int | None:
-        """A register; None if this card, or its driver, does not know it."""
+        """A register, None if this card or its driver does not know it."""
         try:
             return self.card.read(register)
         except DeviceError:
             return None
 
     def read_real_if_known(self, register: int) -> float | None:
-        """A register of a real number; None if this card, or its driver, does not know it."""
+        """A register of a real number, None if this card or its driver does not know it."""
         value, handle = ctypes.c_double(), ctypes.c_void_p(self.card.handle)
         if self.card.spcm.spcm_dwGetParam_d64(handle, register, ctypes.byref(value)):
             self.card.clear_error()
@@ -264,7 +264,7 @@ class Bench:
 
 
 class Transfer:
-    """Samples on their way to the card: handed over, and fetched as far as the card reports it.
+    """Samples on their way to the card, handed over and fetched as far as the card reports.
 
     Args:
         bench: The card.
@@ -273,8 +273,8 @@ class Transfer:
 
     Attributes:
         handed: Bytes handed over so far.
-        is_new_free: Whether a new buffer counts as free for the user. By the manual it counts as full: what
-            is free is then what was fetched, until the whole buffer has been handed over.
+        is_new_free: Whether a new buffer counts as free for the user. By the manual it counts as full, so
+            that only the fetched bytes are free until the whole buffer has been handed over.
     """
 
     is_new_free = False
@@ -286,7 +286,7 @@ class Transfer:
 
     @property
     def user_bytes(self) -> int:
-        """What the card says is free for the user."""
+        """Bytes that the card says are free for the user."""
         return self._card.read(self._card.spcm.SPC_DATA_AVAIL_USER_LEN)
 
     @property
@@ -300,7 +300,7 @@ class Transfer:
         return user_bytes + (behind if self.is_new_free else max(0, behind))
 
     def start_dma(self) -> None:
-        """Let the card fetch what is handed over."""
+        """Let the card fetch the samples that are handed over."""
         self._card.command(self._card.spcm.M2CMD_DATA_STARTDMA, "transfer")
 
     def hand_over(self, n_bytes: int) -> None:
@@ -309,7 +309,7 @@ class Transfer:
         self.handed += n_bytes
 
     def feed(self, user_bytes: int) -> None:
-        """Hand over all whole blocks of what is free."""
+        """Hand over all whole blocks that are free."""
         if free := user_bytes // self.notify_bytes * self.notify_bytes:
             self.hand_over(free)
 
@@ -320,7 +320,7 @@ class Transfer:
         self._card.command(start, "start")
 
     def settled(self, still_s: float = 20e-3) -> int:
-        """Wait until the card reports nothing new for some time; returns the bytes that it has reported."""
+        """Wait until the card reports nothing new for some time, and return the bytes that it reported."""
         count = self.reported
         since_s = self._bench.now()
         while self._bench.now() - since_s < still_s:

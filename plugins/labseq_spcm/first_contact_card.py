@@ -1,4 +1,4 @@
-"""Steps of the first contact with the card itself: what it is, how long calls take, who may call it."""
+"""Steps of the first contact that ask the card about itself, its calls, and who may call it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ REGISTERS: Final = {
     "sequence_segments": "SPC_SEQMODE_AVAILMAXSEGMENT",
     "sequence_steps": "SPC_SEQMODE_AVAILMAXSTEPS",
 }
-"""What is read from the card: key -> register. A card that does not know one leaves null."""
+"""Key -> register that is read from the card. The result is null if the card does not know it."""
 MODES: Final = {
     "replay": "SPC_REP_STD_SINGLE",
     "fifo": "SPC_REP_FIFO_SINGLE",
@@ -59,7 +59,7 @@ DDS_REAL: Final = {
     "phase_step_deg": "SPC_DDS_AVAIL_PHASE_STEP",
 }
 RATES_HZ: Final = (500e6, 600e6, 620e6, 624e6, 625e6, 640e6, 1000e6, 1250e6)
-"""Rates that are tried with an external reference; 624 and 625 MHz are those of the profiles."""
+"""Rates that are tried with an external reference. The profiles use 624 and 625 MHz."""
 
 UNITS: Final = {
     **dict.fromkeys(("card_type", "features", "extended_features", "modes"), ("bits",)),
@@ -86,7 +86,7 @@ def identity(bench: Bench) -> dict[str, Any]:
 
 
 def times(bench: Bench) -> dict[str, Any]:
-    """Time the driver's calls; the relays close once, at the lowest amplitude and without a tone.
+    """Time the driver's calls. The relays close once, at the lowest amplitude and without a tone.
 
     Returns:
         Seconds per call.
@@ -134,7 +134,7 @@ def _open_relays(bench: Bench) -> None:
 
 
 def threads(bench: Bench) -> dict[str, Any]:
-    """Call the library from two threads: an error in one, then reads in both at once.
+    """Call the library from two threads, with an error in one, then reads in both at once.
 
     Returns:
         Whether an error in one thread makes calls of the other fail, and how many of the reads failed.
@@ -163,7 +163,7 @@ def threads(bench: Bench) -> dict[str, Any]:
     read()
     other.join(5.0)
     if other.is_alive():
-        raise DeviceError(bench.name, f"a thread hangs that reads the status {N_READS} times beside another")
+        raise DeviceError(bench.name, f"a thread that reads the status {N_READS} times hangs")
     return {"error_is_shared": bool(code), "reads": 2 * N_READS, "failed_reads": len(failures)}
 
 
@@ -171,8 +171,8 @@ def reference(bench: Bench) -> dict[str, Any]:
     """Make several rates from the external 10 MHz reference.
 
     Returns:
-        Triples: the rate that was asked for, the one that the card made, 0 if it refused, both in Hz; how
-        long its clock took, in seconds.
+        Triples of the rate that was asked for, the rate that the card made or 0 if it refused, both in Hz,
+        and how long its clock took, in seconds.
     """
     card, spcm = bench.fresh(), bench.card.spcm
     card.set(spcm.SPC_CLOCKMODE, spcm.SPC_CM_EXTREFCLOCK, "clock mode")
@@ -195,7 +195,7 @@ def _made_from_reference(bench: Bench, rate_hz: int) -> tuple[int, int, float]:
 
 
 def dds(bench: Bench) -> dict[str, Any]:
-    """Read what the option DDS offers; nothing is played with it, because labseq does not use it."""
+    """Read what the option DDS offers. Nothing is played with it, because labseq does not use it."""
     card, spcm = bench.fresh(), bench.card.spcm
     if not (bench.read_if_known(spcm.SPC_PCIEXTFEATURES) or 0) & spcm.SPCM_FEAT_EXTFW_DDS20:
         return {"skipped": "the card has no licence of the option DDS, which labseq does not need"}
@@ -216,7 +216,7 @@ def second_process(bench: Bench, *, with_tone: bool = False) -> dict[str, Any]:
     """Kill a process that plays, and switch the card off from another one.
 
     Args:
-        with_tone: Leave the memory as it is, and close the relays: an oscilloscope can see what goes on.
+        with_tone: Leave the memory as it is, and close the relays, so that an oscilloscope shows the tone.
 
     Returns:
         Whether the card ran on after its process had died, how long it could not be opened again, what the
@@ -271,7 +271,7 @@ def _call(bench: Bench, script: Path, function: str, arguments: Mapping[str, Any
     """Run a function of a script in a process of its own.
 
     Raises:
-        DeviceError: It failed; with the last line of its message.
+        DeviceError: It failed, with the last line of its message.
     """
     command = [sys.executable, "-c", RUN, str(script), function, json.dumps(arguments)]
     options: Any = {"capture_output": True, "text": True, "timeout": 20.0}

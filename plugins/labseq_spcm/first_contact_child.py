@@ -1,7 +1,7 @@
-"""A process of its own that plays on the card until it is killed, for the first contact.
+"""A separate process that plays on the card until it is killed, for the first contact.
 
-It needs nothing but Python's standard library, and takes the driver library from ``emergency.py`` beside it.
-What it plays is what the card's memory holds, at the lowest amplitude, over and over.
+It needs nothing but Python's standard library, and loads the driver library by ``emergency.py`` in this
+folder. It repeats the content of the card's memory at the lowest amplitude.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TONE_SAMPLES = 1 << 16
 
 
 def play(library: str, card: str, rate_hz: int, relays: bool) -> None:
-    """Play what is in the memory until the process is killed; says "playing" when it has begun."""
+    """Play the content of the memory until the process is killed. It prints "playing" when it has begun."""
     functions = load(library)
     handle = functions.spcm_hOpen(card.encode())
     if not handle:

@@ -1,4 +1,4 @@
-"""Steps of the first contact that need an oscilloscope: what the outputs really do.
+"""Steps of the first contact that need an oscilloscope, which shows the outputs.
 
 The user sets the oscilloscope before a step, and reads it afterwards, when the outputs are off.
 """
@@ -96,7 +96,7 @@ def overwrite(bench: Bench) -> dict[str, Any]:
         bench.look_again(20e-6)
         user_bytes = transfer.user_bytes
         fetched = transfer.fetched(user_bytes) // settings.notify_size
-        if places and fetched > places[-1]:  # silent again before the block is handed over once more:
+        if places and fetched > places[-1]:  # silent again before the block is handed over once more, as
             ring[places[-1] % len(ring)] = 0  # a card that copied it then would play it a round later
         transfer.feed(user_bytes)
         if len(places) < N_BURSTS and bench.now() >= next_s:
@@ -140,7 +140,7 @@ def trigger(bench: Bench) -> dict[str, Any]:
 
 
 def killed(bench: Bench) -> dict[str, Any]:
-    """Leave a tone in the memory, and kill the process that plays it; see ``second_process``."""
+    """Leave a tone in the memory, and kill the process that plays it (see ``second_process``)."""
     card, spcm = bench.fresh(), bench.card.spcm
     card.set(spcm.SPC_MEMSIZE, TONE_SAMPLES, "memory size")
     frames = bench.silence(TONE_SAMPLES * limits.FRAME_BYTES)

@@ -1,4 +1,4 @@
-"""Steps of the first contact that measure how samples get to the card: speed, positions, running dry."""
+"""Steps of the first contact that measure the transfer to the card, its speed, positions and ends."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UNITS: Final = {
 """Units that the names of the results leave out."""
 PAGE: Final = 4096
 NOTIFY_BYTES: Final = (PAGE << 2, PAGE << 4, PAGE << 7, PAGE << 9, PAGE << 10)
-"""The notify sizes of the manual's table: 16 KiB to 4 MiB."""
+"""The notify sizes of the manual's table, 16 KiB to 4 MiB."""
 N_LAGS: Final = 100
 """Number of blocks whose report is waited for."""
 FOLLOWED_S: Final = 0.1
@@ -36,14 +36,14 @@ FOLLOWED_S: Final = 0.1
 SUSTAINED_S: Final = 1.0
 """How long the card plays at the driver's sample rate."""
 POLL_S: Final = 20e-6
-"""Time between two looks, on a virtual clock, at what takes many milliseconds."""
+"""Time between two looks, on a virtual clock, during steps of many milliseconds."""
 
 
 def write_speed(bench: Bench) -> dict[str, Any]:
     """Write to the card's memory at several notify sizes, from a user's and from the driver's buffer.
 
     Returns:
-        "user" and "continuous": pairs of notify size in bytes and speed in bytes per second; the last is
+        "user" and "continuous", pairs of notify size in bytes and speed in bytes per second. "continuous" is
         empty if there is no such buffer.
     """
     sizes = sorted({*NOTIFY_BYTES, bench.settings.notify_size})
@@ -55,7 +55,7 @@ def write_speed(bench: Bench) -> dict[str, Any]:
 
 
 def _speed(bench: Bench, frames: NDArray[np.int16], notify_bytes: int) -> float:
-    """Speed from two amounts, so that what each transfer takes anyway drops out; the fastest of five."""
+    """Speed from two amounts, so that the fixed time of a transfer drops out, the fastest of five."""
     large = frames.nbytes // notify_bytes * notify_bytes
     small = max(notify_bytes, large // 5 // notify_bytes * notify_bytes)
     if large <= small:
@@ -74,7 +74,7 @@ def _write_s(bench: Bench, frames: NDArray[np.int16], notify_bytes: int, n_bytes
 
 
 def positions(bench: Bench) -> dict[str, Any]:
-    """What SPC_DATA_AVAIL_USER_LEN says before, during and after a hand-over, and what fits on the card.
+    """Read SPC_DATA_AVAIL_USER_LEN before, during and after a hand-over, and how much fits on the card.
 
     Returns:
         Bytes that are free for the user after each call, bytes that the card fetches before the start, and
@@ -104,13 +104,13 @@ def positions(bench: Bench) -> dict[str, Any]:
 
 
 def lag(bench: Bench) -> dict[str, Any]:
-    """How late the card reports what it has fetched: at rest, beside a busy computer, and while it plays.
+    """How late the card reports its fetches, at rest, with a busy computer, and while it plays.
 
-    Each figure is the time of the last look that did not show the report yet: a computer that is busy with
+    Each figure is the time of the last look that did not show the report yet, so a computer that is busy with
     something else makes it smaller, not larger.
 
     Returns:
-        Seconds: medians and worst cases; "playing_spread_s" is the variation of the report while the card
+        Medians and worst cases in seconds. "playing_spread_s" is the variation of the report while the card
         plays, "rate_error" the relative difference of its clock from the computer's.
     """
     idle_s = _report_lags(bench)
@@ -132,7 +132,7 @@ def lag(bench: Bench) -> dict[str, Any]:
 def _report_lags(bench: Bench) -> list[float]:
     """From the end of the transfer of one page to its report, in seconds.
 
-    The transfer itself is known from what eight pages take longer than one.
+    The transfer itself is known from how much longer eight pages take than one.
     """
     transfer = bench.transfer(bench.silence(16 << 20), PAGE, 16 << 20)
     transfer.hand_over(PAGE)
@@ -152,7 +152,7 @@ def _report_lags(bench: Bench) -> list[float]:
 
 
 def _playing(bench: Bench) -> tuple[float, float]:
-    """Follow the position of a card that plays: variation of its report, in seconds, and its rate error."""
+    """Follow the position of a playing card. Returns the variation of its report (s) and its rate error."""
     block = bench.settings.notify_size
     transfer = bench.transfer(bench.silence(16 << 20), block, bench.settings.card_buffer)
     transfer.hand_over(transfer.frames.nbytes)
@@ -234,8 +234,8 @@ def starve(bench: Bench) -> dict[str, Any]:
     """Let the card run dry on purpose, with its outputs off, and start it again.
 
     Returns:
-        The status before and after, as bits; which of OVERRUN and READY it has; how long after the last
-        sample it says so; the answer to the next hand-over; whether and how fast it plays again.
+        The status bits before and after, which of OVERRUN and READY it has and how long after the last
+        sample, the answer to the next hand-over, and whether and how fast it plays again.
     """
     block = bench.settings.notify_size
     transfer = bench.transfer(bench.silence(1 << 20), block, bench.settings.card_buffer)
@@ -273,7 +273,7 @@ def starve(bench: Bench) -> dict[str, Any]:
 
 
 def _answer(transfer: Transfer) -> str:
-    """What the library says to samples for a card that is dry; "" if it takes them."""
+    """The library's answer to samples for a card that ran dry, "" if it takes them."""
     try:
         transfer.hand_over(transfer.notify_bytes)
     except DeviceError as error:

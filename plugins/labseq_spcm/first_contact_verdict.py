@@ -1,4 +1,4 @@
-"""What follows from the results of a first contact: what differs from the driver's assumptions."""
+"""The verdict of a first contact, how its results differ from the driver's assumptions."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from labseq_spcm.settings import SpcmSettings
 
 Result: TypeAlias = Mapping[str, Any]
 Claim: TypeAlias = Callable[[Result, SpcmSettings], str]
-"""Compares the result of a step with an assumption; returns how they differ, "" if they agree."""
+"""Compares the result of a step with an assumption, and returns how they differ, "" if they agree."""
 
 NAMING_S: Final = 0.2e-3
 """Longest time to name a small buffer that makes no difference to a shot (ours)."""
 COPIED_S_PER_BYTE: Final = 1 / 50e9
-"""A hand-over that takes longer copies the samples: no processor copies at 50 GB/s (ours)."""
+"""A hand-over that takes longer copies the samples, since no processor copies at 50 GB/s (ours)."""
 DELAY_TOLERANCE_S: Final = 20e-9
-"""By how much the delay of the trigger may differ from the manual's (ours: the worth of a scope reading)."""
+"""Allowed difference of the trigger's delay from the manual's (ours, the error of a scope reading)."""
 LARGEST_NOTIFY_BYTES: Final = 1 << 19
 """The largest ``notify_size`` that the driver takes."""
 HOT_C: Final = 80
@@ -65,7 +65,7 @@ def _sustained(result: Result, _settings: SpcmSettings) -> str:
 
 
 def _overrun(result: Result, _settings: SpcmSettings) -> str:
-    text = f"a card that ran dry does not say so: its status is {result['status_dry']:#x}"
+    text = f"a card that ran dry does not say so, since its status is {result['status_dry']:#x}"
     return "" if result["overrun"] else text
 
 
@@ -144,7 +144,7 @@ STREAM: Final[tuple[tuple[str, Claim], ...]] = (
     ("starve", _recovery),
     ("overwrite", _bursts),
 )
-"""Step, and what the mode ``stream`` assumes of its result: without all of them it must not be used."""
+"""Step, and what ``stream`` assumes of its result. The mode must not be used unless all of these hold."""
 ALL_MODES: Final[tuple[tuple[str, Claim], ...]] = (
     ("identity", _warm),
     ("times", _naming),
@@ -155,11 +155,11 @@ ALL_MODES: Final[tuple[tuple[str, Claim], ...]] = (
     ("trigger", _trigger),
     ("reference", _reference),
 )
-"""Step, and what the driver assumes in every mode; it works without."""
+"""Step, and what the driver assumes in every mode. It works without."""
 
 
 def judge(measured: Mapping[str, Result], settings: SpcmSettings) -> dict[str, Any]:
-    """What differs from the driver's assumptions, and whether the mode ``stream`` works on this card.
+    """Differences from the driver's assumptions, and whether the mode ``stream`` works on this card.
 
     Args:
         measured: Step -> its result.
@@ -186,7 +186,7 @@ def judge(measured: Mapping[str, Result], settings: SpcmSettings) -> dict[str, A
 
 
 def streamed(settings: SpcmSettings) -> dict[str, Any]:
-    """The settings for which a certificate is valid; steps record those with which they measured."""
+    """The settings for which a certificate is valid. Steps record their own."""
     return settings.model_dump(include={"sample_rate", "notify_size", "card_buffer"})
 
 
@@ -200,7 +200,7 @@ def _refused(settings: SpcmSettings) -> list[str]:
 
 
 def _missing(steps: Sequence[str], outdated: Sequence[str]) -> str:
-    """The steps that a certificate needs; some were measured with other settings."""
+    """The steps that a certificate needs, some of which were measured with other settings."""
     named = [f"{step} with an oscilloscope" if step == "overwrite" else step for step in steps]
     text = f"the certificate needs the step{'s' if steps[1:] else ''} {', '.join(named)}"
     was = f" ({', '.join(outdated)} measured with another sample_rate, notify_size or card_buffer)"

@@ -17,8 +17,8 @@ class KeepWarm:
     """One tone per axis, first the row axis.
 
     Attributes:
-        hz: Their frequencies.
-        amplitude: Their amplitudes, of full scale.
+        hz: Frequency of each tone.
+        amplitude: Amplitude of each tone, of full scale.
     """
 
     hz: tuple[float, float]
@@ -68,9 +68,9 @@ def _check_parking(
         return
     ranges = [(low, high) for low, high in ((band[0], below), (above, band[1])) if low <= high]
     free = " or ".join(f"{low / 1e6:.6g} to {high / 1e6:.6g} MHz" for low, high in ranges)
-    limit = f"{free}: within the AOD's band and off the atoms"
+    limit = f"{free}, within the AOD's band and off the atoms"
     if not ranges:
-        limit = "none: the mobile tweezers need the whole band; lower eject_slots"
+        limit = "none, since the mobile tweezers need the whole band; lower eject_slots"
     key = f"{axis}_frequency"
     setting = f"{name}: keep_warm.{key}"
     raise LimitError(setting, f"{hz / 1e6:.6g} MHz", limit, setting=("keep_warm", key))
@@ -79,7 +79,7 @@ def _check_parking(
 def tone_samples(
     tones: KeepWarm, sample_rate_hz: float, row_channel: int, n_samples: int
 ) -> NDArray[np.int16]:
-    """Samples of both outputs that can be repeated, int16 (n_samples, 2): with a whole number of periods."""
+    """Samples of both outputs with a whole number of periods, to be repeated, int16 (n_samples, 2)."""
     frames = np.empty((n_samples, 2), np.int16)
     for axis, channel in enumerate((row_channel, 1 - row_channel)):
         periods = round(tones.hz[axis] / sample_rate_hz * n_samples)

@@ -16,8 +16,8 @@ Longs = NDArray[np.int64]
 def interleave(first: Words, second: Words, out: NDArray[np.uint32]) -> None:
     """Interleave the samples of both outputs, as the card stores them.
 
-    It writes whole frames of unsigned words, so that the processor can do many at a time: uint32 (n,) from
-    the bits of the samples of each output, uint16 (n,), output 0 in the low word.
+    It writes whole frames of unsigned words, so that the processor can do many at a time. They are uint32
+    (n,), from the bits of the samples of each output, uint16 (n,), output 0 in the low word.
     """
     for i in range(len(out)):
         out[i] = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(16))
@@ -27,7 +27,7 @@ def interleave(first: Words, second: Words, out: NDArray[np.uint32]) -> None:
 def take(lock: int, timer: Longs) -> None:
     """Wait until the int64 at an address is 0, and make it 1.
 
-    It sleeps in between: on one core a thread with priority would keep the owner from giving it back.
+    It sleeps in between, since on one core a thread with priority would keep the owner from giving it back.
     """
     while swap(lock, 1):
         sleep_ns(timer, 2_000)

@@ -1,4 +1,4 @@
-"""The driver library of the card: the vendor's, or the one of the simulator package."""
+"""The driver library of the card, the vendor's or the simulator's."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from labseq_spcm_sim import SimulatedLibrary
 
 SIMULATED: Final = "simulated"
-"""Device names that begin like this belong to simulated cards; the vendor's never do."""
+"""Device names that begin like this belong to simulated cards. The vendor's never do."""
 LIBRARY: Final = "spcm_win64.dll" if os.name == "nt" else "libspcm_linux.so"
 
 
 def simulated_settings() -> dict[str, str | int] | str:
-    """Settings of a simulated card, which the vendor's Python package plays on, or why there is none here."""
+    """Settings of a simulated card for the vendor's Python package, or why there is none here."""
     simulated: dict[str, str | int] = {"card": "simulated", "trigger": "software", "serial": 0}
     return missing_package("spcm_core") or simulated
 
@@ -44,33 +44,33 @@ class VendorLibrary:
         return importlib.import_module("spcm_core")
 
     def warm(self) -> None:
-        """Do what takes long before the first shot: nothing."""
+        """Do slow work before the first shot, here none."""
 
     def connect(self) -> str:
-        """Make the card available; returns its device name."""
+        """Make the card available, and return its device name."""
         return self._device_name
 
     def disconnect(self) -> None:
-        """Release the card; no effect if it is not connected."""
+        """Release the card. No effect if it is not connected."""
 
     def functions(self) -> tuple[int, int]:
-        """Addresses of the C functions that read and that write a register of 64 bits."""
+        """Addresses of the C functions that read and write a register of 64 bits."""
         module = importlib.import_module("spcm_core")
         functions = module.spcm_dwGetParam_i64, module.spcm_dwSetParam_i64_
         get, put = (ctypes.cast(function, ctypes.c_void_p).value or 0 for function in functions)
         return get, put
 
     def call_in_virtual_time(self, step: Callable[[], float | None] | None) -> bool:  # noqa: ARG002
-        """Whether time is virtual, so that no thread is needed for what goes on beside the calls: never.
+        """False, because time is never virtual with a real card, and a thread does the work between calls.
 
         Args:
-            step: One step of it, which returns after how many seconds it is to be called again, or None for
-                the last; None: no more steps.
+            step: One step of the work. It returns after how many seconds it is to be called again, or None
+                for the last. None stops the steps.
         """
         return False
 
     def step_time_s(self) -> float:
-        """The time of the step that is being called: there are none."""
+        """The time of the present step, here 0, since there are none."""
         return 0.0
 
     def emergency(self, script: Path, n_outputs: int) -> Emergency | None:

@@ -1,4 +1,4 @@
-"""Figures of the card, and the checks of the set-up against them (memory: ``replay_fifo.py``).
+"""Figures of the card, and the checks of the set-up against them (for memory see ``replay_fifo.py``).
 
 Source of the figures, where no other is named: Spectrum's manual "M4i.66xx/M4i.96xx", chapters on
 analog outputs, clock, generation modes and trigger.
@@ -22,16 +22,16 @@ RATE_GAPS_HZ: Final = ((750e6, 757e6), (1125e6, 1145e6))
 RATE_STEP_HZ: Final = 8
 """Steps of the sample rate with the card's own clock."""
 REFERENCE_TOLERANCE: Final = 1e-3
-"""By how much of itself the rate may differ with an external reference, for which the manual gives no steps
-(ours). The samples are those of the rate that the card reads."""
+"""Allowed relative difference of the rate with an external reference, for which the manual gives no steps
+(ours). The samples are made for the rate that the card reads."""
 REFERENCE_HZ: Final = (10e6, 1.25e9)
 FRAME_BYTES: Final = 4
 """Bytes of one sample of both outputs."""
 OUTPUT_FIFO_BYTES: Final = 192 * 1024
-"""Of the FIFO between the on-board memory and the outputs, whose size is fixed (manual, "Output latency")."""
+"""Fixed size of the FIFO between the on-board memory and the outputs (manual, "Output latency")."""
 
 RELAY_S: Final = 10e-3
-"""Time that the output is off when the path changes; the manual gives none for the output's own relay."""
+"""Time that the output is off when the path changes. The manual gives none for the output's own relay."""
 
 SAMPLE_STEP: Final = 32
 """Memory sizes are multiples of this, in samples per channel."""
@@ -40,7 +40,7 @@ TRIGGER_STEP_MV: Final = 10
 
 
 def trigger_delay_s(sample_rate_hz: float) -> float:
-    """From the trigger to the first sample: 476.5 clocks above 625 MS/s, else 238.5, and 16 ns."""
+    """Delay from the trigger to the first sample, 476.5 clocks above 625 MS/s, else 238.5, and 16 ns."""
     return (476.5 if sample_rate_hz > 625e6 else 238.5) / sample_rate_hz + 16e-9
 
 
@@ -63,7 +63,7 @@ def full_scale_mv(name: str, rf: RfSpec, model: Model) -> int:
     relay_mv = model.relay_mv
     if relay_mv is not None and relay_mv[0] <= amplitude_mv <= relay_mv[1]:
         gap = f"below {relay_mv[0]} mV or above {relay_mv[1]} mV"
-        why = "between them the card's output relay may switch, for 10 ms; for a card with -hbw set `model`"
+        why = "between them the card's output relay may switch, for 10 ms (for a card with -hbw set `model`)"
         raise LimitError(setting, value, gap, why)
     if rf.full_scale_v > rf.max_peak_v:
         most = format_quantity(rf.max_peak_v, "voltage")
@@ -72,7 +72,7 @@ def full_scale_mv(name: str, rf: RfSpec, model: Model) -> int:
 
 
 def reference_warnings(name: str, rate_hz: float, reference_hz: float | None, grid: SiteGrid) -> list[str]:
-    """The rates to use if a sample rate is no whole multiple of the reference clock, as the manual asks."""
+    """Warn if a sample rate is not a whole multiple of the reference clock, as the manual asks."""
     if reference_hz is None or rate_hz % reference_hz == 0:
         return []
     below = math.floor(rate_hz / reference_hz)
@@ -90,7 +90,7 @@ def reference_warnings(name: str, rate_hz: float, reference_hz: float | None, gr
     what = f"profile.{name}.sample_rate is {rate}, not a whole multiple of reference_clock, {reference}"
     why = "the PLL may be unable to make it, and its phase may differ from start to start"
     renders = ", which also has a whole number of samples per tone spacing" if combs else ""
-    return [f"{what}: {why}; the nearest multiples are {low} and {high}; set sample_rate: {good}{renders}"]
+    return [f"{what}, so {why} (nearest multiples: {low}, {high}); set sample_rate: {good}{renders}"]
 
 
 def check_sample_rate(name: str, sample_rate_hz: float, rf: RfSpec) -> None:
@@ -107,8 +107,8 @@ def check_sample_rate(name: str, sample_rate_hz: float, rf: RfSpec) -> None:
 
 
 LONG_COMB: Final = 1024
-"""Samples. Rates whose comb repeats later are rendered up to three times as slowly: with 19 moving tones, on
-one core, in 0.29 of the playing time at 624 MHz (390 samples), 0.39 at 500 MHz (625), 0.93 at 625 MHz (3125).
+"""Samples. Rates whose comb repeats later are rendered up to three times as slowly, with 19 moving tones on
+one core in 0.29 of the playing time at 624 MHz (390 samples), 0.39 at 500 MHz (625), 0.93 at 625 MHz (3125).
 """
 
 

@@ -1,7 +1,7 @@
 """Mobile tweezers on a Spectrum arbitrary waveform generator.
 
-In the manual's order: in ``open`` the card is identified, reset and set up (``set_up.py``), then its mode; in
-``settle`` the outputs; in ``prepare`` the data, in ``play`` the start and the trigger; then stop and close.
+The order is the manual's. ``open`` identifies, resets and sets up the card (``set_up.py``), then its mode.
+``settle`` switches the outputs, ``prepare`` transfers the data, and ``play`` starts and triggers.
 """
 
 from __future__ import annotations
@@ -64,16 +64,16 @@ class SpcmMobileTweezers(MobileTweezers):
     """Plays tone programs on two outputs of an arbitrary waveform generator.
 
     A program is refused before anything is uploaded if it leaves an AOD's band or would clip.
-    Each ``play`` needs its own ``prepare``, so that nothing is ever replayed by mistake. The
-    output amplitude is the profile's ``rf.full_scale``, set once, with the outputs off: it is
-    never changed while atoms are held, except to ramp them down in ``safe_state``.
+    Each ``play`` needs its own ``prepare``, so that nothing is ever replayed by mistake. The output amplitude
+    is the profile's ``rf.full_scale``, set once, with the outputs off. It is never changed while atoms are
+    held, except to ramp them down in ``safe_state``.
 
     Args:
         settings: The card, and how it is used.
         context: Name, clock, simulation, and the limits of the AODs.
 
     Attributes:
-        library: Where the card comes from; a simulated one keeps its card as ``library.card``.
+        library: Where the card comes from. A simulated library keeps its card as ``library.card``.
 
     Raises:
         LimitError: The card or the amplifiers cannot do the profile's ``rf.full_scale``, the sample
@@ -87,7 +87,7 @@ class SpcmMobileTweezers(MobileTweezers):
         self._name = context.name or "mobile_tweezers"
         if trigger_line(context.lines, "mobile_tweezers") is not None:
             if settings.mode == "stream":
-                raise ConfigError(f"{self._name}: a line triggers it, but mode: stream {NO_TRIGGER}")
+                raise ConfigError(f"{self._name}: a line triggers it, but `mode: stream` {NO_TRIGGER}")
             settings = settings.model_copy(update={"trigger": "external"})
         settings, self._uncertified = permitted(settings)
         self._settings = settings
@@ -132,7 +132,7 @@ class SpcmMobileTweezers(MobileTweezers):
 
     @property
     def start_delay_s(self) -> float:
-        """Delay of the outputs; in the mode ``stream`` with the silence ahead of them."""
+        """Delay of the outputs, in the mode ``stream`` with the silence ahead of them."""
         return float(self._facts.get("trigger_delay_s", 0.0))
 
     @property
@@ -141,14 +141,14 @@ class SpcmMobileTweezers(MobileTweezers):
         return math.inf if self._mode is None else self._mode.beginning_s
 
     def warnings(self) -> list[str]:
-        """A stream without a certificate, rates that do not suit the reference clock or render slowly."""
+        """Warn of a stream without a certificate, and of rates that do not suit the reference clock."""
         settings, grid = self._settings, self._context.grid
         rate = self._name, settings.sample_rate
         found = limits.reference_warnings(*rate, settings.reference_clock, grid)
         found = found or limits.rendering_warnings(*rate, grid)
         if self._uncertified:
             what = f"profile.{self._name}.mode is stream, which needs the certificate of a first contact, and"
-            why = f"{self._uncertified}; mode: {settings.mode} is used instead"
+            why = f"{self._uncertified}; `mode: {settings.mode}` is used instead"
             found.append(f"{what} {why} until 'labseq first-contact' has made one")
         return found
 
@@ -172,14 +172,13 @@ class SpcmMobileTweezers(MobileTweezers):
         check_tone_program(self._name, program, self._rf.row_band_hz, self._rf.column_band_hz)
 
     def open(self) -> None:
-        """Open the card and set it up, outputs off; no effect if it is open.
+        """Open the card and set it up, outputs off. No effect if it is open.
 
         Raises:
-            DeviceError: No package or driver library, no such card, another program holds it, it
-                is of another type, or it does not take a setting; or the bus or this computer is too
-                slow for the mode ``stream``.
+            DeviceError: No package or driver library, no such card, another program holds it, another type,
+                it does not take a setting, or the bus or this computer is too slow for ``stream``.
             LimitError: This card cannot do the profile's ``rf.full_scale``.
-            ConfigError: The certificate of the mode ``stream`` is of another card, driver or firmware.
+            ConfigError: The certificate of the mode ``stream`` is for another card, driver or firmware.
         """
         if self._card is not None:
             return
@@ -248,15 +247,15 @@ class SpcmMobileTweezers(MobileTweezers):
         return self._duration_s
 
     def prepare_beginning(self, program: ToneProgram) -> float:
-        """As ``prepare``: a stream plays silence when nothing follows."""
+        """As ``prepare``, since a stream plays silence when nothing follows."""
         return self.prepare(program)
 
     def timings(self) -> Mapping[str, float]:
-        """Times of the last ``prepare`` on this computer's clock, in seconds: rendering, and the rest."""
+        """Times of the last ``prepare`` on this computer's clock, for rendering and the rest (s)."""
         return self._timings
 
     def play(self) -> None:
-        """Start the card, and force the trigger or enable it; returns at once.
+        """Start the card, force or enable the trigger, and return at once.
 
         Raises:
             DeviceError: Nothing was prepared since the last ``play``, still playing, or the card refuses.
@@ -295,12 +294,12 @@ class SpcmMobileTweezers(MobileTweezers):
         self._due_s += added_s
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until the program has been played to its end; returns at once if none is playing.
+        """Wait until the program has been played to its end. Returns at once if none is playing.
 
         Raises:
-            DeviceTimeoutError: It did not end within ``timeout_s``, or the trigger never came; the
-                card is then in its safe state.
-            TransientError: The card ran out of data: what it played is not the program.
+            DeviceTimeoutError: It did not end within ``timeout_s``, or the trigger never came. The card is
+                then in its safe state.
+            TransientError: The card ran out of data, so it did not play the program.
             DeviceError: Not open, or the card refuses.
         """
         mode = self._opened()[1]
@@ -321,7 +320,7 @@ class SpcmMobileTweezers(MobileTweezers):
             if self._due_s is not None:
                 self.safe_state()
                 raise
-        if self._due_s is None:  # by another thread: the card's own errors then come from that
+        if self._due_s is None:  # by another thread, which causes the card's own errors then
             raise DeviceError(self._name, "stopped by safe_state() while it played")
         self._due_s = None
 
@@ -334,13 +333,13 @@ class SpcmMobileTweezers(MobileTweezers):
         return DeviceTimeoutError(self._name, text, timeout_s)
 
     def safe_state(self) -> None:
-        """Ramp down, stop the card, open the output relays; the prepared program is dropped.
+        """Ramp down, stop the card, open the output relays, and drop the prepared program.
 
-        A program that plays is ramped down by the output amplifiers, as far as they go without
-        switching their relay: to a third or less of full scale on each axis.
+        A program that plays is ramped down by the output amplifiers, as far as they go without switching
+        their relay, to a third or less of full scale on each axis.
 
         Raises:
-            DeviceError: The card refused a step; all other steps were done.
+            DeviceError: The card refused a step. All other steps were done.
         """
         self._duration_s = self._due_s = None
         self._is_settled = False
@@ -374,7 +373,7 @@ class SpcmMobileTweezers(MobileTweezers):
             set_amplitude(card, round(self._amplitude_mv - drop_mv))
 
     def close(self) -> None:
-        """Bring the outputs into the safe state and close the card; legal in any state."""
+        """Bring the outputs into the safe state and close the card. Legal in any state."""
         try:
             self.safe_state()
         finally:
@@ -386,7 +385,7 @@ class SpcmMobileTweezers(MobileTweezers):
             card.close()
 
     def emergency(self) -> Emergency | None:
-        """The card is stopped, and its outputs are disabled, by the vendor's library alone."""
+        """A script that stops the card and disables its outputs, with the vendor's library alone."""
         script = Path(__file__).with_name("emergency.py")
         return None if self._card is None else self.library.emergency(script, self._card.n_outputs)
 
@@ -397,9 +396,9 @@ class SpcmMobileTweezers(MobileTweezers):
         return SpcmFirstContact(self._settings, self._context, self.library)
 
     def self_test(self) -> None:
-        """Check the card's firmware, temperatures, clock and memory, outputs off; drops the prepared program.
+        """Check firmware, temperatures, clock and memory, outputs off. This drops the prepared program.
 
-        Samples are sent in the modes ``replay`` and ``sequence``: the others use the memory as a FIFO.
+        Samples are sent in the modes ``replay`` and ``sequence``. The others use the memory as a FIFO.
 
         Raises:
             DeviceError: Not open, still playing, or a check failed.
@@ -412,18 +411,18 @@ class SpcmMobileTweezers(MobileTweezers):
         spcm = card.spcm
         # type 2 is the firmware with which a card starts if its own cannot be loaded
         if card.read(spcm.SPCM_FW_CTRL_ACTIVE) >> 28 == 2:
-            text = "the card runs its recovery firmware; restart the computer, else update the firmware"
+            text = "the card runs its recovery firmware; restart the computer, or update the firmware"
             raise DeviceError(self._name, f"{text} with Spectrum's Control Center")
         sensors = (("base card", spcm.SPC_MON_TC_BASE_CTRL), ("amplifier", spcm.SPC_MON_TC_MODULE_1))
         for place, register in sensors:
             temperature_c = card.read(register)
             if temperature_c > HOT_C:
-                text = f"the {place} has {temperature_c} degrees Celsius; expected at most {HOT_C}"
-                raise DeviceError(self._name, f"{text}: check the fans")
+                text = f"the {place} is at {temperature_c} degrees Celsius, above the limit of {HOT_C}"
+                raise DeviceError(self._name, f"{text}; check the fans")
         rates_hz = card.read(spcm.SPC_SAMPLERATE), self._facts["sample_rate_hz"]
         if rates_hz[0] != rates_hz[1]:
             actual, expected = (format_quantity(hz, "frequency") for hz in rates_hz)
-            raise DeviceError(self._name, f"the sample rate is {actual}; expected {expected}, as it was set")
+            raise DeviceError(self._name, f"the sample rate is {actual}, but it was set to {expected}")
         frames = Buffer().reserve(TEST_SAMPLES)
         frames[:] = 0
         mode.check_memory(frames)
@@ -433,7 +432,7 @@ class SpcmMobileTweezers(MobileTweezers):
         return versions(self._opened()[0])
 
     def describe(self) -> Mapping[str, Any]:
-        """Settings; once opened, also the card and every value that it read back."""
+        """Settings, and once opened also the card and every value that it read back."""
         facts = dict(self._facts)
         if isinstance(self._mode, Stream):
             facts["silent_underruns"] = self._mode.n_underruns
@@ -455,7 +454,7 @@ class SpcmMobileTweezers(MobileTweezers):
 
 
 def _attempt_twice(step: Callable[[], None]) -> LabseqError | None:
-    """Do something, once more if an earlier error still blocked the driver library; returns the failure."""
+    """Do something, twice if an earlier error still blocked the driver library, and return the failure."""
     with suppress(LabseqError):
         step()
         return None

@@ -1,4 +1,4 @@
-"""The cards that the driver plays on. An open card is asked for its limits: the table is for checks before.
+"""The cards that the driver plays on. An open card tells its limits, so the table is for earlier checks.
 
 Source of the table: Spectrum's manual "M4i.66xx/M4i.96xx", technical data.
 """
@@ -11,7 +11,7 @@ from typing import Final
 from labseq_spcm.limits import FRAME_BYTES
 
 SWITCHED_MV: Final = (420, 480)
-"""Both paths of the amplifier make these amplitudes; which one is used depends on the earlier amplitude."""
+"""Both paths of the amplifier make these amplitudes. The earlier amplitude decides which one is used."""
 HIGH_BANDWIDTH: Final = "-hbw"
 """Ending of the name of a card with this option, whose amplifier has the low path only."""
 
@@ -25,7 +25,7 @@ class Model:
         n_outputs: Number of its outputs.
         rate_hz: Lowest and highest sample rate.
         amplitude_mv: Smallest and largest peak voltage into 50 Ohm, in steps of 1 mV.
-        bus_bytes_per_s: What its bus carries to it.
+        bus_bytes_per_s: Speed of its bus towards it.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Model:
 
     @property
     def relay_mv(self) -> tuple[int, int] | None:
-        """The amplitudes at which the amplifier's path may change; None if it has only one."""
+        """The amplitudes at which the amplifier's path may change, None if it has only one."""
         return SWITCHED_MV if self.amplitude_mv[1] > SWITCHED_MV[1] else None
 
     @property
@@ -46,7 +46,7 @@ class Model:
 
 
 def _models() -> dict[str, Model]:
-    """All models, by name: PCIe x8 with 2.8 GB/s, and PXIe x4 with 1.5 GB/s (of any transfer)."""
+    """All models by name, PCIe x8 with 2.8 GB/s and PXIe x4 with 1.5 GB/s (of any transfer)."""
     slow, fast = (50e6, 625e6), (50e6, 1.25e9)
     models: dict[str, Model] = {}
     for series, lanes, speed in (("M4i", "x8", 2.8e9), ("M4x", "x4", 1.5e9)):
@@ -66,11 +66,11 @@ def _models() -> dict[str, Model]:
 
 MODELS: Final = _models()
 ANY: Final = Model("Spectrum card", 2, (50e6, 1.25e9), (80, 2500), 2.8e9)
-"""For checks before a card is open whose model the profile does not name: what one of them can do."""
+"""For checks before a card is open whose model the profile does not name, what any of them can do."""
 FAMILY_NAMES: Final = "a Spectrum M4i.66xx, M4x.66xx, M4i.96xx or M4x.96xx with two or four outputs"
 
 
 def model_name(code: int) -> str:
-    """Name of a model in the table by the type that a card reads: series, family and version."""
+    """Name of a model in the table by the type that a card reads (series, family and version)."""
     series, lanes = {7: ("M4i", "x8"), 8: ("M4x", "x4")}.get(code >> 16 & 0xFF, ("", ""))
     return f"{series}.{code & 0xFFFF:04x}-{lanes}"

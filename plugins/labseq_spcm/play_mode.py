@@ -1,4 +1,4 @@
-"""Base class of the card's modes: how a program gets to the outputs."""
+"""Base class of the card's modes, which bring a program to the outputs."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class PlayMode(ABC):
         card: The open card.
 
     Attributes:
-        max_wait_s: Longest time between two calls of ``finished`` while a program plays, in seconds; 0:
-            call it again at once; inf: the card needs none until the end.
+        max_wait_s: Longest time between two calls of ``finished`` while a program plays, in seconds. 0 means
+            at once, inf not before the end.
         render_s: Time for rendering in the last ``prepare``, on this computer's clock.
-        beginning_s: Playing time after which a program can be cut; inf: only whole programs are played.
+        beginning_s: Playing time after which a program can be cut, inf for whole programs only.
     """
 
     max_wait_s = math.inf
@@ -34,7 +34,7 @@ class PlayMode(ABC):
 
     @abstractmethod
     def prepare(self, program: ToneProgram) -> float:
-        """Transfer a program, or the beginning of one, to the card; returns the playing time in seconds.
+        """Transfer a program or its beginning to the card, and return the playing time in seconds.
 
         Raises:
             LimitError: The mode cannot play it.
@@ -43,7 +43,7 @@ class PlayMode(ABC):
 
     @abstractmethod
     def finished(self) -> bool:
-        """Whether the program was played to its end; called repeatedly, it keeps the card supplied.
+        """Whether the program was played to its end. Repeated calls keep the card supplied.
 
         Raises:
             TransientError: The card ran out of data.
@@ -54,7 +54,7 @@ class PlayMode(ABC):
         self._card.command(command, "start")
 
     def append(self, program: ToneProgram) -> float:  # noqa: ARG002 - the card knows how much it will play
-        """Have the rest of a program follow its beginning; returns its playing time in seconds.
+        """Have the rest of a program follow its beginning, and return its playing time in seconds.
 
         Raises:
             DeviceError: The mode plays whole programs only.
@@ -71,7 +71,7 @@ class PlayMode(ABC):
         """Send samples to the on-board memory while nothing plays, if the mode uploads programs."""
 
     def idle(self) -> None:
-        """Start what plays between programs, if anything does."""
+        """Start the output between programs, if the mode has any."""
 
     def halt(self) -> None:
-        """End what supplies the card beside the calls; the card itself is stopped by the caller."""
+        """End the supply of the card between calls. The caller stops the card itself."""

@@ -1,7 +1,7 @@
-"""Mode ``sequence``: the card loops an idle segment, and programs are uploaded beside it.
+"""Mode ``sequence``, in which the card loops an idle segment while programs are uploaded.
 
-The rules are those of the manual's chapter "Sequence Mode": steps may be written at any time, and a segment
-of the sample memory may be written while the card runs as long as no step in use leads to it.
+The rules come from the manual's chapter "Sequence Mode". Steps may be written at any time, and a segment of
+the sample memory may be written while the card runs as long as no step in use leads to it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from labseq_spcm.stream import silent_joints
 
 IDLE_SEGMENT: Final = 0
 SILENT_SAMPLES: Final = 1024
-"""Length of the idle segment: a program begins at its end, 1.6 us later at most at 624 MS/s."""
+"""Length of the idle segment. A program begins at its end, 1.6 us later at most at 624 MS/s."""
 WARM_SAMPLES: Final = 16384
 """The same with keep-warm tones, whose frequencies are multiples of the sample rate over this length."""
 SEGMENT_SAMPLES: Final = 1 << 20
@@ -43,8 +43,8 @@ class Part:
     """A part of a program, in a segment of its own.
 
     Attributes:
-        number: Counted from the beginning of the program, with what was appended.
-        start: Its first sample, within what is uploaded together.
+        number: Counted from the beginning of the program, including appended parts.
+        start: Its first sample, within the parts that are uploaded together.
         stop: The sample after its last one.
         first: Number of the first part that is linked together with it.
         is_last: Whether it is the last part that is linked then.
@@ -58,21 +58,21 @@ class Part:
 
 
 class SequenceReplay(PlayMode):
-    """Mode ``sequence``: uploads parts of a program into segments, and links the steps that play them.
+    """Uploads parts of a program into segments, and links the steps that play them.
 
-    Part i of a program is in segment i + 1. Two steps belong to it: one plays it, and one waits after it by
-    playing the idle segment until it is led elsewhere. A part that is appended is linked from both steps
-    before it, so it follows without a gap if it comes in time, and else after some silence. Programs use the
-    two halves of the step memory in turn, because the card still waits in the last step of the one before.
+    Part i of a program is in segment i + 1. Two steps belong to it. The first plays it, the second then waits
+    by playing the idle segment until it is led elsewhere. An appended part is linked from both steps before
+    it, so it follows without a gap if it comes in time, and else after some silence. Programs use the two
+    halves of the step memory in turn, because the card still waits in the last step of the program before.
 
     Only parts that begin and end with silence are linked one by one, so tones that are on never wait for
     the computer, and their phases run on through a program.
 
     Args:
         card: The open card.
-        settings: Those of the driver.
+        settings: Settings of the driver.
         sample_rate_hz: The rate that the card's clock really makes.
-        keep_warm: Tones of the idle segment; none: silence.
+        keep_warm: Tones of the idle segment, or None for silence.
 
     Attributes:
         delay_s: From ``start``, or from the edge, to the first sample at the output, at most.
@@ -91,7 +91,7 @@ class SequenceReplay(PlayMode):
         spcm = card.spcm
         if not card.read(spcm.SPC_PCIFEATURES) & spcm.SPCM_FEAT_SEQUENCE:
             text = f"the {card.product} has no sequence mode (SPCM_FEAT_SEQUENCE)"
-            raise DeviceError(card.name, f"{text}; use mode: replay, or update the card's firmware")
+            raise DeviceError(card.name, f"{text}; use `mode: replay`, or update the card's firmware")
         self._row_channel, self._rate_hz = settings.row_index, sample_rate_hz
         self._waits_for_edge = settings.trigger == "external"
         n_idle = SILENT_SAMPLES if keep_warm is None else WARM_SAMPLES
@@ -125,7 +125,7 @@ class SequenceReplay(PlayMode):
         self._first = self._n_parts = 0
 
     def idle(self) -> None:
-        """Start the loop over the idle segment; no effect if it plays."""
+        """Start the loop over the idle segment. No effect if it plays."""
         if self._is_on:
             return
         card, spcm = self._card, self._card.spcm
@@ -136,7 +136,7 @@ class SequenceReplay(PlayMode):
         self._is_on = True
 
     def halt(self) -> None:
-        """Nothing is linked any more; the card is stopped by the caller."""
+        """Link nothing more. The caller stops the card."""
         self._is_on = False
 
     def check_memory(self, frames: NDArray[np.int16]) -> None:
@@ -145,7 +145,7 @@ class SequenceReplay(PlayMode):
         self._card.finish_upload(frames.nbytes, POLL_S)
 
     def prepare(self, program: ToneProgram) -> float:
-        """Render and upload a program, or the beginning of one; returns its playing time in seconds."""
+        """Render and upload a program or its beginning, and return its playing time in seconds."""
         self._first = 0 if self._waiting >= self._n_steps // 2 else self._n_steps // 2
         self._n_parts = 0
         renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
@@ -164,7 +164,7 @@ class SequenceReplay(PlayMode):
             self._card.command(spcm.M2CMD_CARD_ENABLETRIGGER, "enabling the trigger")
 
     def append(self, program: ToneProgram) -> float:
-        """Have the rest of a program follow, each part when it has arrived; returns its playing time, s."""
+        """Have the rest of a program follow, each part when it has arrived. Returns its playing time (s)."""
         renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
         n_samples = renderer.n_samples
         size = self._part_size(n_samples, 2)  # a batch may fill its last segment in part only
@@ -207,12 +207,12 @@ class SequenceReplay(PlayMode):
         if least > self._room:
             quantity = f"{self._card.name}: length of the program"
             length, most = (f"{n / self._rate_hz:.4g} s" for n in (n_samples, n_free * self._room))
-            hint = "use mode: fifo, or a lower sample_rate"
-            raise LimitError(quantity, length, f"{most}: the card's memory", hint)
+            hint = "use `mode: fifo`, or a lower sample_rate"
+            raise LimitError(quantity, length, f"{most} (the card's memory)", hint)
         return max(min(CHUNK, self._room), least)
 
     def _split(self, ends: Sequence[int], size: int) -> Iterator[Part]:
-        """Split what is linked at once, and ends at these samples, into parts of about equal size."""
+        """Split samples that are linked at once, with joints at ``ends``, into parts of about equal size."""
         for start, end in itertools.pairwise([0, *ends]):
             length, first = end - start, self._n_parts
             n = max(1, round(length / size), math.ceil(length / self._room))
@@ -233,7 +233,7 @@ class SequenceReplay(PlayMode):
                 self._send(part.number + 1, frames)
             else:
                 self._arrive(on_the_way)
-                self._send(part.number + 1, frames)  # before the steps are written: the bus is not left idle
+                self._send(part.number + 1, frames)  # before the steps are written, to keep the bus busy
                 self._link(on_the_way)
             on_the_way = part
         if on_the_way is not None:
@@ -254,7 +254,7 @@ class SequenceReplay(PlayMode):
             raise DeviceError(self._card.name, "stopped by safe_state() while a program was uploaded")
 
     def _link(self, part: Part) -> None:
-        """Write the steps of a part that has arrived; the last one before a joint is linked."""
+        """Write the steps of a part that has arrived. The last one before a joint is linked."""
         plays, waits = self._first + 2 * part.number, self._first + 2 * part.number + 1
         if not part.is_last:
             self._write_step(plays, part.number + 1, plays + 2)

@@ -1,4 +1,4 @@
-"""The modes that play rendered samples: ``replay`` from the card's memory, ``fifo`` as a stream."""
+"""The modes that play rendered samples, ``replay`` from the card's memory and ``fifo`` as a stream."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from labseq_spcm.play_mode import PlayMode
 from labseq_spcm.settings import SpcmSettings
 
 CHUNK: Final = 1 << 18
-"""Samples rendered at a time, 0.4 ms at 625 MS/s: few enough to stay in the processor's cache."""
+"""Samples rendered at a time, 0.4 ms at 625 MS/s, few enough to stay in the processor's cache."""
 RING_CHUNKS: Final = 4
 CHUNK_BYTES: Final = CHUNK * FRAME_BYTES
 
 
 class InterleavedRenderer:
-    """Renders a program as the card stores it: the samples of both outputs interleaved.
+    """Renders a program as the card stores it, with the samples of both outputs interleaved.
 
     It renders in the caller's thread. A second thread would have to be waited for, and where other
     programs keep the processor busy that takes longer than the rendering it would take over.
@@ -46,11 +46,11 @@ class InterleavedRenderer:
         self.n_samples = max(1, math.ceil(self._renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP
 
     def write(self, start: int, out: NDArray[np.int16]) -> None:
-        """Render some samples; after the end of the program there is silence.
+        """Render some samples, with silence after the end of the program.
 
         Args:
             start: Index of the first sample.
-            out: Result, int16 (n, 2): a column per output.
+            out: Result, int16 (n, 2), a column per output.
         """
         from labseq_spcm.kernels import interleave
 
@@ -64,7 +64,7 @@ class InterleavedRenderer:
 
 
 class Replay(PlayMode):
-    """Mode ``replay``: uploads the whole program, then waits for its end."""
+    """Mode ``replay``, which uploads the whole program, then waits for its end."""
 
     def __init__(self, card: AwgCard, settings: SpcmSettings, sample_rate_hz: float) -> None:
         super().__init__(card)
@@ -77,15 +77,15 @@ class Replay(PlayMode):
         self._memory_samples = card.read(spcm.SPC_PCIMEMSIZE) // FRAME_BYTES
 
     def prepare(self, program: ToneProgram) -> float:
-        """Render and upload a program; returns its playing time in seconds."""
+        """Render and upload a program, and return its playing time in seconds."""
         start_s = time.perf_counter()
         renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
         n_samples = renderer.n_samples
         if n_samples > self._memory_samples:
             quantity = f"{self._card.name}: length of the program"
             length, most = (f"{n / self._rate_hz:.4g} s" for n in (n_samples, self._memory_samples))
-            hint = "use mode: fifo, or a lower sample_rate"
-            raise LimitError(quantity, length, f"{most}: the card's memory", hint)
+            hint = "use `mode: fifo`, or a lower sample_rate"
+            raise LimitError(quantity, length, f"{most} (the card's memory)", hint)
         frames = self._buffer.reserve(n_samples)
         renderer.write(0, frames)
         self.render_s = time.perf_counter() - start_s
@@ -105,14 +105,14 @@ class Replay(PlayMode):
 
 
 class Fifo(PlayMode):
-    """Mode ``fifo``: streams a program while the rest is still being rendered.
+    """Mode ``fifo``, which streams a program while the rest is still being rendered.
 
     Rendered chunks go into a ring in the computer, from there over the bus into the card's memory,
     and from there to the outputs. Ring and memory are bounded, so a program is rendered about
-    ``fill`` ahead. Before the start both are filled, or hold the whole program: the ring is rendered and
-    handed over, the transfer started, and when the card reports its first block the rest follows, except
-    for the last chunk of its memory, of which it may keep a part for itself. The card knows how many
-    samples to play: it stops after them, and reports if it runs dry before.
+    ``fill`` ahead. Before the start both are filled, or hold the whole program. First the ring is rendered
+    and handed over, and the transfer started. When the card reports its first block the rest follows, except
+    for the last chunk of its memory, of which it may keep a part for itself. The card knows how many samples
+    to play. It stops after them, and reports if it runs dry before.
     """
 
     max_wait_s = 0.0
@@ -125,7 +125,7 @@ class Fifo(PlayMode):
         self._renderer: InterleavedRenderer | None = None
         self._n_rendered = self._n_samples = 0
         ahead = int(settings.fill_s * sample_rate_hz) * FRAME_BYTES - self._ring.nbytes
-        # of the on-board memory, in bytes; the card takes powers of two
+        # of the on-board memory, in bytes, a power of two
         self._fill = 1 << round(math.log2(max(2 * CHUNK_BYTES, ahead)))
         spcm = card.spcm
         card.set(spcm.SPC_CARDMODE, spcm.SPC_REP_FIFO_SINGLE, "card mode")
@@ -134,7 +134,7 @@ class Fifo(PlayMode):
         card.write_setup()  # the buffer of a transfer is named afterwards
 
     def prepare(self, program: ToneProgram) -> float:
-        """Fill ring and card with the beginning of a program; returns its playing time in seconds."""
+        """Fill ring and card with the beginning of a program, and return its playing time in seconds."""
         card, spcm = self._card, self._card.spcm
         start_s = time.perf_counter()
         self._renderer = InterleavedRenderer(program, self._rate_hz, self._row_channel)
@@ -158,7 +158,7 @@ class Fifo(PlayMode):
         return self._n_samples / self._rate_hz
 
     def finished(self) -> bool:
-        """Feed the card while it has room; whether it has played to the end."""
+        """Feed the card while it has room. True if it has played to the end."""
         try:
             is_full = self._feed() < RING_CHUNKS
         except DeviceError:  # the card may have stopped just after it reported room
@@ -174,11 +174,11 @@ class Fifo(PlayMode):
         if status & spcm.M2STAT_DATA_OVERRUN or (ended and self._n_rendered < self._n_samples):
             share = f"{min(1.0, self._n_rendered / self._n_samples):.0%} of the program was rendered in time"
             text = f"underrun: the card ran out of samples ({share}); raise `fill`, lower sample_rate, or use"
-            raise TransientError(f"{text} the mode sequence", self._card.name)
+            raise TransientError(f"{text} `mode: sequence`", self._card.name)
         return ended
 
     def _feed(self) -> int:
-        """Render into the ring while there is room, once around at most; returns how many chunks."""
+        """Render into the ring while there is room, once around at most, and return the number of chunks."""
         card, spcm, renderer = self._card, self._card.spcm, self._renderer
         for n_chunks in range(RING_CHUNKS):
             if renderer is None or self._n_rendered >= self._n_samples:

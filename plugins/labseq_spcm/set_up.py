@@ -17,28 +17,28 @@ from labseq_spcm.models import FAMILY_NAMES, HIGH_BANDWIDTH, MODELS, Model, mode
 from labseq_spcm.settings import SpcmSettings
 
 NEXT_OUTPUT: Final = 100
-"""From a register of an output to that of the next one."""
+"""Distance from a register of an output to the same register of the next output."""
 
 
 def check_type(card: AwgCard, settings: SpcmSettings) -> Model:
-    """Check that it is the card that the settings name, and that it can do what they ask for.
+    """Check that the card is the one in the settings, and that it can do what they ask for.
 
     Raises:
-        DeviceError: It is another one, or too slow.
+        DeviceError: It is another card, or too slow.
     """
     model = read_model(card, settings.card, settings.model)
     if settings.serial and card.serial_number != settings.serial:
         text = f"the card '{settings.card}' has the serial number {card.serial_number}"
-        raise DeviceError(card.name, f"{text}; expected {settings.serial}: name another one as `card`")
+        raise DeviceError(card.name, f"{text}, not {settings.serial}; name another card as `card`")
     if max(settings.outputs) >= model.n_outputs:
         text = f"the {model.name} has {model.n_outputs} outputs"
         raise DeviceError(card.name, f"{text}; set row_channel and column_channel to two of them")
     is_streamed, (least_hz, fastest_hz) = settings.mode in ("fifo", "stream"), model.rate_hz
     most_hz, rate_hz = model.fifo_rate_hz if is_streamed else fastest_hz, settings.sample_rate
     if not least_hz <= rate_hz <= most_hz:
-        how = f" in mode: {settings.mode}" if is_streamed else ""
+        how = f" in `mode: {settings.mode}`" if is_streamed else ""
         text = f"the {model.name} makes {least_hz / 1e6:g} to {most_hz / 1e6:g} MS/s{how}"
-        raise DeviceError(card.name, f"{text}; sample_rate is {rate_hz / 1e6:g} MHz")
+        raise DeviceError(card.name, f"{text}, but sample_rate is {rate_hz / 1e6:g} MHz")
     spcm = card.spcm
     mode = spcm.SPC_REP_FIFO_SINGLE if is_streamed else spcm.SPC_REP_STD_SINGLE
     if not card.read(spcm.SPC_AVAILCARDMODES) & mode:
@@ -49,15 +49,15 @@ def check_type(card: AwgCard, settings: SpcmSettings) -> Model:
 
 
 def read_model(card: AwgCard, device: str, named: str) -> Model:
-    """What the open card can do, as it reads itself.
+    """The open card's own limits.
 
     Args:
         card: The card.
         device: Its device name.
-        named: Its model in the settings; "": any.
+        named: Its model in the settings, "" for any.
 
     Raises:
-        DeviceError: It is another one, of another family, or has too few outputs.
+        DeviceError: It is another model, of another family, or has too few outputs.
     """
     spcm, product = card.spcm, card.product
     n_outputs = card.read(spcm.SPC_MIINST_MODULES) * card.read(spcm.SPC_MIINST_CHPERMODULE)
@@ -65,13 +65,13 @@ def read_model(card: AwgCard, device: str, named: str) -> Model:
     row = MODELS.get(model_name(code))
     if row is None:
         is_fast = code & spcm.TYP_FAMILYMASK == spcm.TYP_M5I63XX_X16 & spcm.TYP_FAMILYMASK
-        why = ": labseq does not know its steps of memory, amplifiers and delays" if is_fast else ""
+        why = ", whose steps of memory, amplifiers and delays labseq does not know" if is_fast else ""
         text = f"the card '{device}' is a {product} with {n_outputs} outputs{why}"
-        raise DeviceError(card.name, f"{text}; expected {FAMILY_NAMES}: name another one as `card`")
+        raise DeviceError(card.name, f"{text}; use {FAMILY_NAMES}")
     if n_outputs < 2:
         why = "both axes must be on one card, as labseq does not drive the star-hub that starts two together"
-        text = f"the card '{device}' is a {product} with one output; {why}"
-        raise DeviceError(card.name, f"{text}: use {FAMILY_NAMES}")
+        text = f"the card '{device}' is a {product} with one output, but {why}"
+        raise DeviceError(card.name, f"{text}; use {FAMILY_NAMES}")
     model = replace(
         row,
         name=product,
@@ -81,12 +81,12 @@ def read_model(card: AwgCard, device: str, named: str) -> Model:
     )
     actual = row.name + HIGH_BANDWIDTH * (model.relay_mv is None)
     if named and named != actual:
-        raise DeviceError(card.name, f"the card '{device}' is a {actual}; the profile has model: {named}")
+        raise DeviceError(card.name, f"the card '{device}' is a {actual}, but `model` is {named}")
     return model
 
 
 def set_up(card: AwgCard, settings: SpcmSettings, amplitude_mv: int) -> dict[str, Any]:
-    """Set up everything that does not depend on the mode; returns facts about the card and its real rate."""
+    """Set up everything that does not depend on the mode. Returns facts about the card and its real rate."""
     card.command(card.spcm.M2CMD_CARD_RESET, "reset")
     card.set(card.spcm.SPC_CHENABLE, sum(1 << channel for channel in card.outputs), "active channels")
     rate_hz = _set_clock(card, settings)
@@ -104,7 +104,7 @@ def set_up(card: AwgCard, settings: SpcmSettings, amplitude_mv: int) -> dict[str
 
 
 def identity(card: AwgCard) -> dict[str, str]:
-    """What a first contact is valid for: serial number, model, driver and firmware."""
+    """Serial number, model, driver and firmware, for which a first contact is valid."""
     software = versions(card)
     return {
         "serial": str(card.serial_number),
@@ -115,7 +115,7 @@ def identity(card: AwgCard) -> dict[str, str]:
 
 
 def versions(card: AwgCard) -> dict[str, tuple[str, str]]:
-    """Versions of the vendor's software and of the firmware: installed, tested; no real card was tested."""
+    """Versions of the vendor's software and the firmware, installed and tested. No real card was tested."""
     spcm = card.spcm
     return {
         "package spcm_core": (metadata.version("spcm_core"), "1.0.11"),
@@ -132,7 +132,7 @@ def _version(card: AwgCard, register: int) -> str:
 
 
 def _set_clock(card: AwgCard, settings: SpcmSettings) -> float:
-    """Set the sample clock; returns the rate that it really makes, in Hz.
+    """Set the sample clock, and return the rate that it really makes, in Hz.
 
     It is written to the card here, with the outputs off, because the PLL may take 0.2 s to lock.
     """
@@ -161,7 +161,7 @@ def _set_outputs(card: AwgCard, amplitude_mv: int) -> None:
 
 
 def _set_trigger(card: AwgCard, settings: SpcmSettings) -> None:
-    """No source at all for the software trigger: it is forced, which works alike in all modes."""
+    """Set the trigger, with no source for the software trigger, which is forced in all modes."""
     spcm = card.spcm
     card.set(spcm.SPC_TRIG_ANDMASK, spcm.SPC_TMASK_NONE, "trigger AND mask")
     if settings.trigger == "software":
@@ -183,7 +183,7 @@ def set_amplitude(card: AwgCard, amplitude_mv: int) -> None:
 
 
 def close_relays(card: AwgCard) -> bool:
-    """Close the relays of both outputs; whether any was open, and has to settle now."""
+    """Close the relays of both outputs. True if any was open, and has to settle now."""
     registers = [card.spcm.SPC_ENABLEOUT0 + NEXT_OUTPUT * output for output in card.outputs]
     if all(card.read(register) for register in registers):
         return False

@@ -13,23 +13,23 @@ from labseq_spcm.models import ANY, MODELS, Model
 Mode: TypeAlias = Literal["sequence", "replay", "fifo", "stream"]
 Channel: TypeAlias = Literal[0, 1, 2, 3]
 
-NO_TRIGGER: Final = "takes no external trigger: a stream waits for nothing; use mode: sequence for it"
+NO_TRIGGER: Final = "takes no external trigger, since a stream waits for nothing; use `mode: sequence`"
 
 
 class KeepWarmSettings(Settings):
     """A tone on each axis that plays whenever no program does, so that the AODs stay warm."""
 
-    row_frequency: Frequency = Field(description="tone of the row axis: within the AOD's band, off the atoms")
+    row_frequency: Frequency = Field(description="tone of the row axis, in the AOD's band and off the atoms")
     column_frequency: Frequency = Field(description="tone of the column axis, likewise")
     amplitude: Annotated[float, Field(gt=0, le=1)] | None = Field(
         default=None,
-        description="of full scale, on both axes; none: the mean power of as many tones as the profile "
+        description="of full scale, on both axes. With none, the mean power of as many tones as the profile "
         "allows at once",
     )
 
 
 class CardFaults(Settings):
-    """What the simulated card does otherwise than the driver assumes; nothing by default."""
+    """Differences of the simulated card from the driver's assumptions, by default none."""
 
     copies_samples: bool = Field(
         default=False,
@@ -48,7 +48,7 @@ class CardFaults(Settings):
     )
     first_contact: FilePath | None = Field(
         default=None,
-        description="file of `labseq first-contact`: the simulated card does what was measured there; none: "
+        description="file of `labseq first-contact` with the behaviour of the simulated card, or none for "
         "what the driver assumes",
     )
 
@@ -59,73 +59,71 @@ class SpcmSettings(Settings):
     card: str = Field(
         default="/dev/spcm0",
         min_length=1,
-        description="device name in the vendor's driver; `simulated` for a card that exists only in software",
+        description="device name in the vendor's driver, or `simulated` for a card only in software",
     )
     model: str = Field(
         default="",
         description="product name that the card must have, such as M4i.6631-x8, or M4i.6631-x8-hbw with that "
-        "option, to check its limits before it is opened; none: any",
+        "option, to check its limits before it is opened, or empty for any",
     )
-    serial: int = Field(default=0, ge=0, description="serial number that the card must have; 0: any")
+    serial: int = Field(default=0, ge=0, description="serial number that the card must have, or 0 for any")
     mode: Mode = Field(
         default="sequence",
-        description="sequence: uploaded in parts beside a loop that plays, which then leads to them; "
-        "replay: uploaded whole, then played; fifo: streamed while it is being rendered; "
-        "stream: the same, spliced into silence that the card plays all the time",
+        description="`sequence` uploads a program in parts while a loop plays that then leads to them. "
+        "`replay` uploads it whole, then plays it. `fifo` streams it while it is being rendered. "
+        "`stream` does so too, spliced into silence that the card plays all the time",
     )
     sample_rate: Frequency = Field(
-        default=625e6, description="samples per second; the card rounds it to 8 Hz"
+        default=625e6, description="samples per second, which the card rounds to 8 Hz"
     )
     row_channel: Channel = Field(default=0, description="output that drives the row axis")
     column_channel: Channel | None = Field(
-        default=None, description="output that drives the column axis; none: the other one of 0 and 1"
+        default=None, description="output that drives the column axis. With none, the other of 0 and 1"
     )
     trigger: Literal["software", "external"] = Field(
         default="software",
-        description="what starts a program: the driver, or an edge at the input Ext0, also from a line with "
+        description="what starts a program, the driver or an edge at the input Ext0, also from a line with "
         "`triggers: mobile_tweezers`",
     )
     trigger_level: Annotated[Voltage, Field(ge=-10, le=10)] = Field(
         default=1.5, description="level of the edge, in steps of 10 mV"
     )
     trigger_edge: Literal["rising", "falling"] = Field(default="rising", description="which edge counts")
-    trigger_50_ohm: bool = Field(
-        default=False, description="terminate Ext0 with 50 Ohm; otherwise it has 1 kOhm"
-    )
+    trigger_50_ohm: bool = Field(default=False, description="terminate Ext0 with 50 Ohm instead of 1 kOhm")
     reference_clock: Frequency | None = Field(
         default=None,
         ge=limits.REFERENCE_HZ[0],
         le=limits.REFERENCE_HZ[1],
-        description="external reference of the sample clock; none: the card's own",
+        description="external reference of the sample clock, or none for the card's own",
     )
     fill: Annotated[Duration, Field(ge=1e-3, le=1.0)] | None = Field(
         default=None,
-        description="playing time that is rendered ahead; none: 20 ms for stream, 8 ms for fifo; fifo takes "
+        description="playing time to render ahead. With none, 20 ms for stream, 8 ms for fifo. fifo takes "
         "it roughly, because the card takes powers of two",
     )
     look_ahead: Annotated[Duration, Field(gt=0, le=10e-3)] | None = Field(
         default=None,
-        description="stream: how far ahead of the outputs a program begins, which is how long it takes to "
-        "them at most; none: 0.25 ms, or more if the card's buffers hold more at this sample rate",
+        description="for `stream`, how far ahead of the outputs a program begins, and how long it takes to "
+        "them at most. With none, 0.25 ms, or more if the card's buffers hold more at this sample rate",
     )
     notify_size: int = Field(
         default=1 << 16,
         ge=1 << 12,
         le=1 << 19,
-        description="stream: bytes after which the card reports what it has fetched, a power of two; "
-        "programs begin at multiples of it",
+        description="for `stream`, bytes after which the card reports what it has fetched, a power of two. "
+        "Programs begin at multiples of it",
     )
     card_buffer: int = Field(
         default=1 << 17,
         ge=1 << 13,
         le=1 << 24,
-        description="stream: bytes of on-board memory that are used, a power of two, at least 2 notify_size",
+        description="for `stream`, bytes of on-board memory to use, a power of two, at least 2 notify_size",
     )
     faults: CardFaults = Field(
-        default=CardFaults(), description="what the simulated card does otherwise than a real one should"
+        default=CardFaults(), description="how the simulated card differs from what a real card should do"
     )
     keep_warm: KeepWarmSettings | None = Field(
-        default=None, description="sequence and stream: tones off the atoms between programs; none: silence"
+        default=None, description="for `sequence` and `stream`, tones off the atoms between programs"
     )
 
     @field_validator("model")
@@ -137,7 +135,7 @@ class SpcmSettings(Settings):
 
     @property
     def limits(self) -> Model:
-        """What the card can do, as far as the profile names it."""
+        """Limits of the card, as far as the profile names it."""
         return MODELS.get(self.model, ANY)
 
     @property
@@ -148,7 +146,7 @@ class SpcmSettings(Settings):
 
     @property
     def row_index(self) -> int:
-        """Place of the row axis in each pair of samples: the card takes its outputs in ascending order."""
+        """Place of the row axis in a pair of samples, which is in ascending order of the outputs."""
         return int(self.outputs[0] > self.outputs[1])
 
     @field_validator("sample_rate")
@@ -190,14 +188,14 @@ class SpcmSettings(Settings):
         if self.card.upper().startswith("TCPIP"):
             needed = f"{limits.FRAME_BYTES * self.sample_rate / 1e9:.2g} GB/s"
             raise ValueError(
-                f"mode: {self.mode} needs {needed}, which the network to {self.card} does not carry; "
-                "use mode: replay"
+                f"`mode: {self.mode}` needs {needed}, which the network to {self.card} does not carry; "
+                "use `mode: replay`"
             )
         if self.sample_rate > self.limits.fifo_rate_hz:
             rate, most = _hz(self.sample_rate), _hz(self.limits.fifo_rate_hz)
             raise ValueError(
                 f"sample_rate is {rate}, but the bus carries at most {most} on two channels; lower it, or "
-                "use mode: sequence"
+                "use `mode: sequence`"
             )
         return self
 
@@ -212,22 +210,22 @@ class SpcmSettings(Settings):
     def _check_stream(self) -> Self:
         if self.keep_warm is not None and self.mode not in ("sequence", "stream"):
             raise ValueError(
-                f"keep_warm is set, but mode: {self.mode} leaves the AODs dark while it uploads "
-                "programs; use mode: sequence, or leave keep_warm out"
+                f"keep_warm is set, but `mode: {self.mode}` leaves the AODs dark while it uploads "
+                "programs; use `mode: sequence`, or leave keep_warm out"
             )
         if self.mode != "stream":
             return self
         if self.trigger == "external":
-            raise ValueError(f"mode: stream {NO_TRIGGER}")
+            raise ValueError(f"`mode: stream` {NO_TRIGGER}")
         if self.card_buffer < 2 * self.notify_size:
             least = f"at least twice notify_size, {2 * self.notify_size}"
             why = "the card reports whole blocks, and is started when it has one"
-            raise ValueError(f"card_buffer is {self.card_buffer}; expected {least}: {why}")
+            raise ValueError(f"card_buffer is {self.card_buffer}; expected {least}, since {why}")
         least_s = self._buffered_s(self.sample_rate)
         if self.look_ahead is not None and self.look_ahead < least_s:
             look_ahead, least = (format_quantity(s, "time") for s in (self.look_ahead, least_s))
             raise ValueError(
-                f"look_ahead is {look_ahead}; expected at least {least}: the card's own buffers and two "
+                f"look_ahead is {look_ahead}; expected at least {least}, for the card's own buffers and two "
                 "blocks of notify_size at this sample_rate"
             )
         return self
@@ -238,7 +236,7 @@ class SpcmSettings(Settings):
 
     @property
     def overhead_per_cycle_s(self) -> float:
-        """Time from a cycle's plan to its light in the mode that is used: measured, see the timing budget."""
+        """Time from a cycle's plan to its light in the present mode (measured, see the timing budget)."""
         from labseq_spcm.certificate import permitted
 
         mode = permitted(self)[0].mode

@@ -1,4 +1,4 @@
-"""Mode ``stream``: the card plays all the time, and programs are spliced into the silence between them."""
+"""Mode ``stream``, in which the card plays all the time, and programs are spliced into its silence."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from labseq_spcm.play_mode import PlayMode
 from labseq_spcm.settings import SpcmSettings
 
 BEGINNING_S: Final = 1e-3
-"""A program is cut after that time: making the rest takes less, even if the computer is busy."""
+"""A program is cut after that time. Making the rest takes less, even if the computer is busy."""
 TRIES: Final = 5
 BUS_SAMPLES: Final = 1 << 22
-"""Most samples that are sent to measure the speed of the bus: 6 ms at 2.8 GB/s."""
+"""Most samples that are sent to measure the speed of the bus, 6 ms at 2.8 GB/s."""
 PCIE_BYTES_PER_S: Final = {1: 0.175e9, 2: 0.35e9, 3: 0.69e9}
-"""What a lane of a generation carries to the card: 70 % of its bits, as in the manual's 2.8 GB/s over eight
-lanes of generation 2 (with payloads of 256 bytes); later ones at least as much as the third."""
+"""Speed of a lane of each generation to the card, 70 % of its bits, as in the manual's 2.8 GB/s over eight
+lanes of generation 2 (with payloads of 256 bytes). Later ones carry at least as much as the third."""
 
 
 def check_rendering(name: str, context: Context, sample_rate_hz: float, row_channel: int) -> None:
-    """Render programs with as many tones as the profile allows, on one core; of each part the fastest counts.
+    """Render programs with as many tones as the profile allows, on one core. The fastest of each part counts.
 
     Raises:
         DeviceError: This computer renders more slowly than the card plays.
@@ -69,13 +69,13 @@ def check_rendering(name: str, context: Context, sample_rate_hz: float, row_chan
             start_s = time.perf_counter()
             k.render_frames(box, program.words, start, place, n_part)
             took_s[number] = min(took_s[number], time.perf_counter() - start_s)
-        # two cores are 1.6 times as fast as one: each renders an axis, one interleaves both
+        # two cores are 1.6 times as fast as one, as each renders an axis and one interleaves both
         rendered_hz = n_samples / took_s.sum() * (1.6 if n_cores() > 1 else 1.0)
         if sample_rate_hz < 0.9 * rendered_hz:  # the rest is for other work of the computer
             return
     required, reached = (format_quantity(hz, "frequency") for hz in (sample_rate_hz, rendered_hz))
-    text = f"mode: stream at {required}, but this computer renders {n_tones} moving tones at {reached}"
-    hint = "use a lower sample_rate, one with a whole number of samples per tone spacing, or mode: sequence"
+    text = f"`mode: stream` needs {required}, but this computer renders {n_tones} moving tones at {reached}"
+    hint = "lower sample_rate, best to a whole number of samples per tone spacing, or use `mode: sequence`"
     raise DeviceError(name, f"{text}; {hint}")
 
 
@@ -85,9 +85,9 @@ class Program:
 
     Attributes:
         words: See :mod:`labseq_spcm.stream_kernels`.
-        axes: Those of its renderer.
+        axes: Axes of its renderer.
         cuts: Samples where pieces end.
-        renderer: It owns the memory of the axes.
+        renderer: Owner of the memory of the axes.
         playing_s: Its length.
     """
 
@@ -105,7 +105,7 @@ def stream_program(
     block: int,
     workspaces: dict[tuple[int, int], Any],
 ) -> Program:
-    """Make a program for the loop, whole blocks of samples long; the workspaces must live as long."""
+    """Make a program for the loop, whole blocks of samples long. The workspaces must live as long."""
     renderer = Renderer(program, sample_rate_hz)
     axes, words = renderer.words(workspaces), np.zeros(k.N_PROGRAM, np.int64)
     n_samples = max(1, math.ceil(renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP
@@ -136,13 +136,13 @@ def new_scratch() -> NDArray[np.int16]:
 
 
 class Stream(PlayMode):
-    """Mode ``stream``: keeps the card supplied from ``idle`` to ``halt``.
+    """Mode ``stream``, which keeps the card supplied from ``idle`` to ``halt``.
 
     Samples go into a ring in the computer, from there over the bus into the card's buffer and its
     output FIFO, and from there to the outputs. The whole ring is handed over at all times, silence where no
-    program plays, so that a computer which is held up costs nothing then. A program is written over the
-    silence that the card is about to fetch; it is rendered faster than it is played, so more and more of it
-    is ahead. A compiled loop does that in a thread of its own, without Python's lock
+    program plays, so that a delay of the computer costs nothing then. A program is written over the silence
+    that the card is about to fetch. It is rendered faster than it is played, so more and more of it is ahead.
+    A compiled loop does that in a thread of its own, without Python's lock
     (:mod:`labseq_spcm.stream_kernels`), and sleeps for a quarter of the ring when there is nothing to do. On
     a virtual clock the simulated card calls its steps in its time. Python fills the card before its start,
     also after it ran dry.
@@ -150,7 +150,7 @@ class Stream(PlayMode):
     Attributes:
         n_underruns: How often the card ran dry in silence, and was started again.
         delay_s: From ``start`` to the first sample at the output, at most.
-        bus_bytes_per_s: What the bus carries, as measured.
+        bus_bytes_per_s: Measured speed of the bus.
 
     Raises:
         DeviceError: The bus is too slow for the sample rate.
@@ -167,7 +167,7 @@ class Stream(PlayMode):
         self._row_channel = settings.row_index
         self._block = block = settings.notify_size // FRAME_BYTES
         self._on_card = (settings.card_buffer + OUTPUT_FIFO_BYTES) // FRAME_BYTES
-        # a block less than the whole: the card may keep some bytes for itself, and reports whole blocks
+        # a block less than the whole, since the card may keep some bytes and reports whole blocks
         self._to_start = settings.card_buffer // FRAME_BYTES // block * block - block
         ahead = settings.look_ahead_s(sample_rate_hz) * sample_rate_hz - self._on_card
         self._ahead = max(2, int(ahead / block)) * block
@@ -179,7 +179,7 @@ class Stream(PlayMode):
         if keep_warm is not None:
             self._silence[:] = tone_samples(keep_warm, sample_rate_hz, settings.row_index, block)
         self._ring.reshape(-1, block, 2)[:] = self._silence
-        # for what is rendered between `prepare` and `start`: at most 0.8 ms at 625 MS/s
+        # for samples rendered between `prepare` and `start`, at most 0.8 ms at 625 MS/s
         self._ready = [Buffer().reserve(1 << 19) for _ in range(3)]
         for frames in self._ready:
             frames[:] = 0  # so that the memory is there
@@ -199,7 +199,7 @@ class Stream(PlayMode):
         self._set_mode(settings)
 
     def _new_box(self) -> NDArray[np.int64]:
-        """The words that Python and the loop share; a loop that has not ended yet keeps its own."""
+        """The words that Python and the loop share. A loop that has not ended yet keeps its own."""
         box = np.zeros(k.N_WORDS, np.int64)
         box[k.GET], box[k.SET] = self._card.library.functions()
         box[k.HANDLE], box[k.RENDER] = self._card.handle, render_address()
@@ -213,10 +213,10 @@ class Stream(PlayMode):
         return box
 
     def _check_bus(self) -> float:
-        """Check that the bus carries the stream; returns its speed in bytes per second.
+        """Check that the bus carries the stream, and return its speed in bytes per second.
 
-        First what the slot is, as the card reads it, then transfers of two sizes to its memory: from one to
-        the other nothing counts but the samples. Of each size the fastest counts.
+        The card first tells its slot. Then transfers of two sizes go to its memory, so that only the
+        difference of samples counts. Of each size the fastest counts.
 
         Raises:
             DeviceError: It is too slow.
@@ -225,7 +225,7 @@ class Stream(PlayMode):
         generation, lanes = card.read(spcm.SPC_PCIEXPGENERATION), card.read(spcm.SPC_PCIEXPLANES)
         slot = lanes * PCIE_BYTES_PER_S.get(generation, PCIE_BYTES_PER_S[3])
         if slot < needed:
-            raise self._too_slow(f"the slot has {lanes} lanes of PCIe generation {generation}: it", slot)
+            raise self._too_slow(f"the slot with {lanes} lanes of PCIe generation {generation}", slot)
         frames, sizes = Buffer().reserve(BUS_SAMPLES), (BUS_SAMPLES // 4, BUS_SAMPLES)
         card.set(spcm.SPC_MEMSIZE, BUS_SAMPLES, "memory size")
         took_s = [min(card.upload(frames[:n], poll_s=20e-6) for _ in range(TRIES)) for n in sizes]
@@ -237,8 +237,8 @@ class Stream(PlayMode):
     def _too_slow(self, what: str, bytes_per_s: float) -> DeviceError:
         rate, most = (format_quantity(hz, "frequency") for hz in (self._rate_hz, bytes_per_s / FRAME_BYTES))
         needed = FRAME_BYTES * self._rate_hz
-        text = f"{what} carries {bytes_per_s / 1e9:.3g} GB/s, but mode: stream at {rate} needs"
-        hint = f"use a slot with more lanes, a sample_rate below {most}, or mode: sequence"
+        text = f"{what} carries {bytes_per_s / 1e9:.3g} GB/s, but `mode: stream` at {rate} needs"
+        hint = f"use a slot with more lanes, a sample_rate below {most}, or `mode: sequence`"
         return DeviceError(self._card.name, f"{text} {needed / 1e9:.3g} GB/s; {hint}")
 
     def _set_mode(self, settings: SpcmSettings) -> None:
@@ -249,7 +249,7 @@ class Stream(PlayMode):
         card.write_setup()
 
     def idle(self) -> None:
-        """Start the stream; no effect if it is on."""
+        """Start the stream. No effect if it is on."""
         with self._lock:
             if self._is_on:
                 return
@@ -268,7 +268,7 @@ class Stream(PlayMode):
                 threading.Thread(target=target, args=arguments, name=name, daemon=True).start()
 
     def halt(self) -> None:
-        """End the supply and drop the programs; the card is stopped by the caller."""
+        """End the supply and drop the programs. The caller stops the card."""
         self._stop.set()
         self._card.library.call_in_virtual_time(None)
         with self._lock:
@@ -280,10 +280,10 @@ class Stream(PlayMode):
                 time.sleep(50e-6)
 
     def prepare(self, program: ToneProgram) -> float:
-        """Hand a program to the loop, which renders it until it starts; returns its playing time, s."""
+        """Hand a program to the loop, which renders it until it starts. Returns its playing time (s)."""
         start_s = time.perf_counter()
         stream = self._prepared = self._new_program(program)
-        if self._has_thread:  # in virtual time the loop's work would be this thread's
+        if self._has_thread:  # in virtual time this thread would do the loop's work
             with self._lock:
                 self._box[k.PREPARED] = stream.words.ctypes.data
                 self._wake()
@@ -300,7 +300,7 @@ class Stream(PlayMode):
         return stream
 
     def start(self, command: int) -> None:  # noqa: ARG002 - the card runs already
-        """Have the prepared program follow what was handed over."""
+        """Have the prepared program follow the samples that were handed over."""
         self._check_failure()
         with self._lock:
             program, self._prepared = self._prepared, None
@@ -323,7 +323,7 @@ class Stream(PlayMode):
         self._wake()
 
     def _wake(self) -> None:
-        """Let the loop look at once: on a virtual clock its step is due now."""
+        """Let the loop look at once. On a virtual clock its step is due now."""
         for signal in self._signals[:1]:
             set_signal(signal.words)
         if self._is_on and not self._has_thread:
@@ -336,7 +336,7 @@ class Stream(PlayMode):
 
     @property
     def least_ahead_s(self) -> float:
-        """Least time by which the last program was written ahead of the card; below 0: too late."""
+        """Least time by which the last program was written ahead of the card, below 0 if too late."""
         return float(self._box[k.LEAST]) / self._rate_hz
 
     def finished(self) -> bool:
@@ -348,7 +348,7 @@ class Stream(PlayMode):
 
     def _check_failure(self) -> None:
         """Let a virtual clock's steps be done, and raise the error that ended the stream."""
-        if not self._has_thread:  # beside a thread, a call could meet an error that is the thread's
+        if not self._has_thread:  # with a thread, a call could meet the thread's error
             _ = self._card.status
         with self._lock:
             failure, self._failure = self._failure, None
@@ -360,7 +360,7 @@ class Stream(PlayMode):
     def _help(
         self, box: NDArray[np.int64], _stop: threading.Event, signal: WakeSignal, _programs: deque[Program]
     ) -> None:
-        """The thread that renders one of the two axes; from now on it is reckoned with."""
+        """The thread that renders one of the two axes, which the loop uses from now on."""
         raise_priority(above=1)
         box[k.HELPER] = signal.words.ctypes.data
         k.assist(box, new_timer(), signal.words)
@@ -388,10 +388,10 @@ class Stream(PlayMode):
         return self._step(self._box, code) if code < 0 else 1e-9 * code
 
     def _step(self, box: NDArray[np.int64], code: int) -> float | None:
-        """Do what is left to Python: what follows a code of the loop.
+        """React to a code of the loop in Python.
 
         Returns:
-            Time to wait, in seconds; 0: the loop can go on; None: it is over.
+            Time to wait in seconds, 0 if the loop can go on, None if it is over.
         """
         if not self._lock.acquire(blocking=False):  # the driver is about to halt, or to read a failure
             return 10e-6
@@ -411,7 +411,7 @@ class Stream(PlayMode):
         return bool(self._box[k.WRITTEN] >= self._box[k.SILENT_FROM])
 
     def _begin(self, *, is_silent: bool) -> None:
-        """Fill the card with silence, which the ring has already or not; it is started when it has some."""
+        """Fill the card with silence, and start it when it has some. The ring may hold silence already."""
         card, spcm, box = self._card, self._card.spcm, self._box
         card.stop()
         box[k.WRITTEN] = box[k.FETCHED] = box[k.START] = box[k.END] = box[k.MADE] = 0
@@ -429,11 +429,11 @@ class Stream(PlayMode):
         return DeviceError(self._card.name, f"supplying the card: {reason}")
 
     def _recover(self, code: int) -> None:
-        """The card ran dry, or was too fast: begin again, with the program if it cannot have begun.
+        """Begin again after the card ran dry or was too fast, with the program if it cannot have begun.
 
         Raises:
             TransientError: In the middle of a program.
-            DeviceError: The card runs, but the library reports an error; or it does not fetch samples.
+            DeviceError: The card runs, but the library reports an error, or it does not fetch samples.
         """
         box, card = self._box, self._card
         if code == k.STUCK:
@@ -446,7 +446,7 @@ class Stream(PlayMode):
                 raise self._error()
         start, made, end, fetched = (int(box[word]) for word in (k.START, k.MADE, k.END, k.FETCHED))
         is_unfinished = made < end or fetched < end  # silence after what was made may have been fetched
-        # only whole blocks are reported as fetched: a part of the first one may have been played
+        # only whole blocks are reported as fetched, so a part of the first one may have been played
         may_have_begun = start <= fetched and start < made
         if code == k.LATE or (may_have_begun and is_unfinished):
             played = max(0, min(fetched, made) - start) / (end - start)
@@ -454,7 +454,7 @@ class Stream(PlayMode):
             share = f"{played:.0%} of a part of {length} was played"
             was_full = made - start >= len(self._ring) - self._ahead - self._on_card
             remedy = (
-                f"raise `{'fill' if was_full else 'look_ahead'}`, lower sample_rate, or use the mode sequence"
+                f"raise `{'fill' if was_full else 'look_ahead'}`, lower sample_rate, or use `mode: sequence`"
             )
             raise TransientError(
                 f"underrun: the card ran out of samples ({share}); {remedy}", self._card.name

@@ -1,9 +1,9 @@
-"""The loop that keeps a running card supplied, compiled: it needs Python's lock at no time.
+"""The compiled loop that keeps a running card supplied without ever taking Python's lock.
 
 The whole ring is handed over to the card at all times, silence where no program plays. A program is written
-over the silence that the card is about to fetch, piece by piece: between two pieces no tone is on, and a
-piece begins when all of it is rendered, or when so much is ahead of the card that it surely will be in time.
-The driver library's functions are called by their addresses. Python and the loop share one array, int64
+over the silence that the card is about to fetch, piece by piece. Between two pieces no tone is on. A piece
+begins when all of it is rendered, or when so much is ahead of the card that it surely will be in time. The
+driver library's functions are called by their addresses. Python and the loop share one array, int64
 (N_WORDS,), whose words one of the two writes and the other reads.
 """
 
@@ -39,32 +39,33 @@ TONES: Final = f"{const('int32', 1)}, {const('float64', 1)}, {const('float64', 1
 COMMAND, STATUS, USER_LEN, CARD_LEN = 100, 110, 200, 202
 """M2CMD, M2STATUS, DATA_AVAIL_USER_LEN and DATA_AVAIL_CARD_LEN, as in the vendor's header files."""
 ENDED: Final = 0x4 | 0x400
-"""M2STAT_CARD_READY or M2STAT_DATA_OVERRUN: it does not run, or ran dry, after which it need not be ready."""
+"""M2STAT_CARD_READY (it does not run) or M2STAT_DATA_OVERRUN (it ran dry, and need not be ready)."""
 
 (GET, SET, HANDLE, RENDER, RING, N_RING, BLOCK, ON_CARD, AHEAD, SILENCE, SCRATCH, VALUE) = range(12)
-"""Set before the loop: the library's functions and the card's handle, :func:`render_address`,
-address and samples of the ring, samples of a block, on the card, and from what was fetched to where a program
-may begin; addresses of a block of silence, of room for 2 x CHUNK samples, and of the next word but one."""
+"""Set before the loop: the library's functions and the card's handle, :func:`render_address`, address and
+samples of the ring, samples of a block, on the card, and from the fetched samples to where a program may
+begin. Then the addresses of a block of silence, of room for 2 x CHUNK samples, and of the next word but
+one."""
 FOUND: Final = 12
 STOP, QUEUED, QUEUE = 13, 14, 15
-"""Written by Python: end the loop, the number of programs so far, and the addresses of the last N_QUEUE."""
+"""Written by Python to end the loop, the number of programs so far, and the addresses of the last N_QUEUE."""
 N_QUEUE: Final = 4
 PREPARED: Final = 19
-"""Written by Python: address of the program that will be queued next, 0 if there is none."""
+"""Written by Python, the address of the program that will be queued next, 0 if there is none."""
 (TAKEN, WRITTEN, FETCHED, START, END, MADE, UNTIL, PART, LEAST, N_PAUSES, SILENT_FROM, ERROR) = range(20, 32)
 """Written by the loop: programs begun, samples handed over and fetched, where the last program starts and
 ends, up to where it is in the ring, how many samples of it may be written, from where on the last part of it
-has just been written (-1: none), the least distance of such a part from what the card may have fetched by
+has just been written (-1 for none), the least distance of such a part from what the card may have fetched by
 then, how many pieces came later than planned, from where on the ring holds silence again, and the library's
 error code."""
 (IS_FEEDING, RENDERED_AT, SLOW) = range(32, 35)
-"""Likewise: whether the loop runs, what was fetched when a block was last rendered whose place was not known,
-and how much the card fetched meanwhile."""
+"""Also by the loop, whether it runs, the samples fetched when a block was last rendered whose place was not
+known, and how much the card fetched meanwhile."""
 (HELPER, POSTED, DONE, HELP_AXIS, HELP_START, HELP_OUT) = range(35, 41)
-"""Address of the signal for :func:`assist` in another thread, 0 if there is none; a part of the column axis
-that waits to be rendered and one that was, and which: the arguments of RENDER."""
+"""Address of the signal for :func:`assist` in another thread, 0 if there is none. Then a part of the column
+axis that waits to be rendered, one that was rendered, and the arguments of RENDER for it."""
 (LOCK, TIMER) = range(46, 48)
-"""Addresses of the lock of the library's calls, 0 where a call is what calls the loop; and of its timer."""
+"""Addresses of the lock of the library's calls, 0 where a call itself calls the loop, and of its timer."""
 (IS_FILLING, TO_START, START_COMMAND, NOW_NS, FILLED_BY_NS) = range(41, 46)
 """Whether the card is filled before its start, the samples that it must have fetched then, the M2CMD, the
 time of this step, and when the filling must be over."""
@@ -80,18 +81,18 @@ samples, their number, and where in the stream the program begins."""
 N_PROGRAM: Final = 11
 
 FOLLOWED_NS: Final = 100_000_000
-"""How long the least lag is taken for the drift of the clocks against one another."""
+"""Time over which the least lag shows the drift of the clocks against each other."""
 DRIFT: Final = 20e-6
-"""How much slower the card's clock may be than the computer's; the manual gives 5 ppm for the card's."""
+"""How much slower the card's clock may be than the computer's. The manual gives 5 ppm for the card's."""
 UNKNOWN: Final = 1 << 62
 FILLED_NS: Final = 2_000_000
-"""From then on after the start the card's buffers are full; before it holds less than the clock says."""
+"""Time after the start when the card's buffers are full. Before, it holds less than the clock says."""
 SURE: Final = 4
 """A piece is surely in time if so many times its length is ahead."""
 CHUNK: Final = 1 << 15
 """Samples rendered at a time, few enough to stay in the processor's cache until they are interleaved."""
 MOST_SAMPLES: Final = 1 << 17
-"""Samples written at a time, 0.2 ms at 625 MS/s, if there is room: the loop looks for STOP after them."""
+"""Samples written at a time, 0.2 ms at 625 MS/s, if there is room. The loop looks for STOP after them."""
 FILLING_POLL_NS: Final = 20_000
 """Time between two looks at a card that is filled before its start."""
 FILLING_NS: Final = 1_000_000_000
@@ -106,8 +107,8 @@ WAIT_MS: Final = 100
 """Longest wait for a signal."""
 
 STOPPED, DRY, FAILED, LATE, STUCK = -1, -2, -3, -4, -5
-"""The driver asked for the end; the card has stopped; the library reports an error; the card may have fetched
-samples before they were written; it did not fetch enough samples to be started."""
+"""The driver asked for the end, the card has stopped, the library reports an error, the card may have fetched
+samples before they were written, or it did not fetch enough samples to be started."""
 
 
 @kernel(f"int64({const('int64', 1)}, {TONES}, {TONES}, int64[::1])")
@@ -117,9 +118,9 @@ def find_cuts(
     column_offsets: Shorts, column_start: Reals, column_end: Reals,
     cuts: Words,
 ) -> int:  # fmt: skip
-    """Find the joints between segments at which no tone is on; returns their number.
+    """Find the joints between segments at which no tone is on, and return their number.
 
-    The amplitudes are those of a program's axes; ``cuts`` are the first samples after these joints.
+    The amplitudes belong to the program's axes. ``cuts`` are the first samples after these joints.
     """
     n = 0
     for i in range(1, len(first_sample) - 1):
@@ -140,7 +141,7 @@ def find_cuts(
 
 @helper_kernel("int64(int64[::1], int64, int64, int64)")
 def call_library(box: Words, function: int, register: int, value: int) -> int:
-    """Call one of the library's functions while no other thread does; returns its error code."""
+    """Call one of the library's functions while no other thread does, and return its error code."""
     if box[LOCK]:
         take(box[LOCK], carray(pointer(box[TIMER]), N_TIMER, np.int64))
     box[ERROR] = call_c(function, box[HANDLE], register, value)
@@ -151,14 +152,14 @@ def call_library(box: Words, function: int, register: int, value: int) -> int:
 
 @helper_kernel("int64(int64[::1], int64)")
 def read(box: Words, register: int) -> int:
-    """A register of the card; FAILED if the library reports an error."""
+    """A register of the card, FAILED if the library reports an error."""
     call_library(box, box[GET], register, box[VALUE])
     return FAILED if box[ERROR] else box[FOUND]  # pyright: ignore[reportReturnType]
 
 
 @helper_kernel("int64(int64[::1], int64)")
 def hand_over(box: Words, n_samples: int) -> int:
-    """Let the card fetch samples that are in the ring; returns 0 or FAILED."""
+    """Let the card fetch samples that are in the ring. Returns 0 or FAILED."""
     if call_library(box, box[SET], CARD_LEN, n_samples * FRAME_BYTES):
         return FAILED
     box[WRITTEN] += n_samples
@@ -175,9 +176,9 @@ def copy(source: int, out: int, n_samples: int) -> None:
 
 @kernel("void(int64[::1], int64[::1], int64, int64, int64)")
 def render_frames(box: Words, program: Words, start: int, out: int, n_samples: int) -> None:
-    """Render samples of a program as the card stores them; after its end there is silence.
+    """Render samples of a program as the card stores them, with silence after its end.
 
-    Of ``box`` it needs RENDER and SCRATCH only, so that it can be called while the loop hands silence over.
+    It uses only RENDER and SCRATCH of ``box``, so that it can be called while the loop hands silence over.
     """
     for done in range(0, n_samples, CHUNK):
         n = min(CHUNK, n_samples - done)
@@ -217,7 +218,7 @@ def assist(box: Words, timer: Words, signal: Words) -> None:
 
 @helper_kernel("int64(int64[::1], int64)")
 def supply_program(box: Words, room: int) -> int:
-    """Copy or render the next part of a piece into the ring; returns 0 or FAILED.
+    """Copy or render the next part of a piece into the ring. Returns 0 or FAILED.
 
     A part is at most a quarter of what is ahead of the card, so that it is there long before its time. Only
     whole blocks are handed over.
@@ -242,7 +243,7 @@ def supply_program(box: Words, room: int) -> int:
 
 @kernel("int64(int64[::1], int64)")
 def supply_silence(box: Words, n_samples: int) -> int:
-    """Hand over blocks of silence, at most so many samples; returns 0 or FAILED."""
+    """Hand over blocks of silence, at most ``n_samples``. Returns 0 or FAILED."""
     block = box[BLOCK]
     n = min(box[N_RING], n_samples // block * block)
     if n <= 0:
@@ -260,7 +261,7 @@ def look(box: Words) -> int:
     """Read how much of the ring the card has fetched.
 
     Returns:
-        Samples that are still in the ring; or DRY or FAILED.
+        Samples that are still in the ring, or DRY or FAILED.
     """
     free = read(box, USER_LEN)
     if free < 0:
@@ -278,7 +279,7 @@ def look(box: Words) -> int:
 
 @helper_kernel("boolean(int64[::1], int64[::1], int64)")
 def render_ahead(box: Words, program: Words, until: int) -> bool:
-    """Render more samples whose place is not known yet, before a certain one; returns whether it did."""
+    """Render more samples whose place is not known yet, up to ``until``. Returns whether it did."""
     done = program[BASE] + program[N_READY]
     n = min(box[BLOCK], min(until, program[BASE] + program[ROOM]) - done)
     if n <= 0:
@@ -291,12 +292,12 @@ def render_ahead(box: Words, program: Words, until: int) -> bool:
 
 @helper_kernel("void(int64[::1], int64)")
 def follow_clock(box: Words, rate_hz: int) -> None:
-    """Work out how many samples the card has fetched at most by the clock, in whole blocks: BY_CLOCK.
+    """Work out BY_CLOCK, the most samples that the card can have fetched by the clock, in whole blocks.
 
     It plays since its start and holds no more than its buffers do. The report lags behind that by a part of a
-    block, and by the time of an interrupt. How much the lag changes from one tenth of a second to the next is
-    the drift of the clocks: a card that gains is followed at once, one that loses only as fast as clocks may
-    differ, because its reports may also have become later.
+    block, and by the time of an interrupt. The change of the lag from one tenth of a second to the next is
+    the drift of the clocks. A card that gains is followed at once. A card that loses is followed only as fast
+    as clocks may differ, because its reports may also have become later.
     """
     played = 1e-9 * (box[NOW_NS] - box[STARTED_NS]) * rate_hz
     lag = int(played) + box[ON_CARD] + box[SHIFT] - box[FETCHED]
@@ -323,7 +324,7 @@ def earliest(box: Words) -> int:
 
 @helper_kernel("void(int64[::1])")
 def take_program(box: Words) -> None:
-    """Make the next program the present one; it begins where the last one ends, or as soon as it can."""
+    """Make the next program the present one. It begins where the last one ends, or as soon as it can."""
     program = carray(pointer(box[QUEUE + box[TAKEN] % N_QUEUE]), N_PROGRAM, np.int64)
     start = max(box[END], earliest(box))
     box[END] = start + program[LENGTH]
@@ -336,7 +337,7 @@ def take_program(box: Words) -> None:
 
 @helper_kernel("int64(int64[::1])")
 def begin_piece(box: Words) -> int:
-    """Render the next piece, as far as there is room for it, and then let it begin; returns 0 or FAILED.
+    """Render the next piece, as far as there is room for it, then let it begin. Returns 0 or FAILED.
 
     If much is ahead of the card it begins at once. If its time has passed, silence is longer, and all that
     follows comes later. A computer that has just been slow is given more time.
@@ -369,7 +370,7 @@ def begin_piece(box: Words) -> int:
 def is_in_time(box: Words) -> bool:
     """Whether the last part was written before the card fetched it.
 
-    The card reports whole blocks, so it may have fetched one more; and as much as the clock says, if its
+    The card reports whole blocks, so it may have fetched one more, or as much as the clock says, if its
     report is later than a block.
     """
     if box[PART] < 0:
@@ -381,7 +382,7 @@ def is_in_time(box: Words) -> bool:
 
 @helper_kernel("int64(int64[::1])")
 def start_when_filled(box: Words) -> int:
-    """Start the card once it has fetched enough; returns after how many ns to look again, or a code."""
+    """Start the card once it has fetched enough. Returns after how many ns to look again, or a code."""
     if box[FETCHED] < box[TO_START]:
         if box[FILLED_BY_NS] == 0:
             box[FILLED_BY_NS] = box[NOW_NS] + FILLING_NS
@@ -389,7 +390,7 @@ def start_when_filled(box: Words) -> int:
     box[IS_FILLING] = box[FILLED_BY_NS] = box[SHIFT] = 0
     box[LEAST_LAG] = box[USUAL_LAG] = UNKNOWN
     error = call_library(box, box[SET], COMMAND, box[START_COMMAND])
-    if box[TIMER]:  # the card plays from some time during the call: reckon with the latest
+    if box[TIMER]:  # the card plays from some time during the call, so assume the latest
         box[NOW_NS] = now_ns(carray(pointer(box[TIMER]), N_TIMER, np.int64))
     box[STARTED_NS], box[WINDOW_NS] = box[NOW_NS], box[NOW_NS] + FOLLOWED_NS
     return FAILED if error else 0
@@ -397,7 +398,7 @@ def start_when_filled(box: Words) -> int:
 
 @kernel("int64(int64[::1], int64)")
 def supply(box: Words, rate_hz: int) -> int:
-    """One step: write what there is room for; returns after how many ns that is due again, or a code."""
+    """Write as much as there is room for. Returns after how many ns that is due again, or a code."""
     in_ring = look(box)
     if box[IS_FILLING] and in_ring != FAILED:
         return start_when_filled(box)  # pyright: ignore[reportReturnType]
@@ -429,7 +430,7 @@ def supply(box: Words, rate_hz: int) -> int:
 
 @kernel("int64(int64[::1], int64, int64[::1], int64[::1])")
 def feed(box: Words, rate_hz: int, timer: Words, signal: Words) -> int:
-    """Supply the card until STOP is set, in a thread of its own; returns a negative code."""
+    """Supply the card until STOP is set, in a thread of its own. Returns a negative code."""
     box[IS_FEEDING] = 1
     code = STOPPED
     while box[STOP] == 0:

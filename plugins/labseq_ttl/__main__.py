@@ -1,4 +1,4 @@
-"""Look at a timing box, and give it a serial number: ``python -m labseq_ttl PORT [--serial N]``."""
+"""Look at a timing box, and give it a serial number (``python -m labseq_ttl PORT [--serial N]``)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from labseq_ttl.box import Box, open_box
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print what a box is; returns the exit code: 3 if there is none."""
+    """Print a box's identity and state, and return the exit code, 3 if there is no box."""
     parser = ArgumentParser(prog="python -m labseq_ttl", description="Look at a timing box.")
     parser.add_argument("port", help="its serial port, /dev/ttyACM0")
     parser.add_argument("--serial", type=int, help="give it this serial number, 0 to 65535", metavar="N")

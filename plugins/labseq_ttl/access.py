@@ -1,4 +1,4 @@
-"""How the driver gets to its box: a real one at a serial port, or a simulated one."""
+"""Access of the driver to its box, at a serial port or simulated."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ class RealBox:
         return open_box(self._port, self._device)
 
     def disconnect(self) -> None:
-        """The port was closed; no effect if it is not connected."""
+        """The port was closed. No effect if it is not connected."""
 
     def lines_set(self, program: LineProgram) -> None:
         """The lines were set to the state of this program, at once."""
 
     def fired(self, program: LineProgram | None) -> None:
-        """A program was fired; None: one that changes no line."""
+        """A program was fired, None for a program that changes no line."""
 
     def is_over(self, end_s: float) -> bool:  # noqa: ARG002 - the box itself has reported it
-        """Whether a program is over that the box has played, and that ends at this time."""
+        """Whether a program that the box plays, and that ends at this time, is over."""
         return True
 
     def wait_until(self, end_s: float, timeout_s: float) -> float:  # noqa: ARG002 - the box reports the end
-        """Wait for the end of a program; returns how long to wait for the box's message."""
+        """Wait for the end of a program, and return how long to wait for the box's message."""
         return timeout_s
 
     def raise_go(self, timeout_s: float) -> float:
-        """Wait for a leader's `go`; returns how long to wait for the box's message."""
+        """Wait for a leader's `go`, and return how long to wait for the box's message."""
         return timeout_s
 
 

@@ -1,4 +1,4 @@
-"""The box at its serial port: lines with checksums, its commands, and the errors that it reports."""
+"""The box at its serial port, with checksummed lines, its commands, and the errors that it reports."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _REFUSED: Final = "? no damaged"
 _GARBLED: Final = "?"
 
 BOOT_S: Final = 3.0
-"""How long a box may take to its first answer: an Arduino is reset when its port is opened."""
+"""How long a box may take to its first answer. An Arduino is reset when its port is opened."""
 
 BOOT_TRY_S: Final = 0.5
 
@@ -44,9 +44,9 @@ def open_box(name: str, device: str) -> Port:
 class Conversation:
     """Commands to the box and its answers, one after the other.
 
-    Every line carries a tag, which the answer repeats, so that a late answer is not taken for that of
-    another command. A damaged line is sent again, on either side. The box also sends messages without
-    being asked, such as the end of a program.
+    Every line carries a tag, which the answer repeats, so that a late answer is not taken for another
+    command's. A damaged line is sent again, on either side. The box also sends messages without being asked,
+    such as the end of a program.
     """
 
     def __init__(self, port: Port, device: str, clock: Clock, max_wait_s: float) -> None:
@@ -70,7 +70,7 @@ class Conversation:
         Args:
             question: The command and its arguments.
             again: Whether it may be sent again if no answer comes.
-            max_wait_s: How long an answer may take, in seconds; None: the usual time.
+            max_wait_s: How long an answer may take, in seconds, None for the usual time.
             tries: How often it is sent at most.
 
         Returns:
@@ -97,7 +97,7 @@ class Conversation:
         raise DeviceTimeoutError(self._device, self._silence_text(question, max_wait_s), max_wait_s)
 
     def new_events(self, timeout_s: float = 0.0) -> list[str] | None:
-        """Wait for a message of the box that is not an answer; returns its words, or None if none came."""
+        """Wait for a message of the box that is not an answer. Returns its words, or None if none came."""
         return self._wait(lambda: self._news.popleft() if self._news else None, timeout_s)
 
     def drop_messages(self) -> None:
@@ -111,16 +111,16 @@ class Conversation:
         self._n_stops += 1
         self.send(STOP)
         with self.lock:
-            # until the box has said so, it drops what it receives
+            # until the box has confirmed it, it drops everything
             self._wait(lambda: ["off"] in [event[:1] for event in self._news] or None, self._max_wait_s)
             self.ask("off", tries=1)
 
     def emergency(self) -> Emergency | None:
-        """How another process turns all lines off; None without a real port."""
+        """The byte by which another process turns all lines off, None without a real port."""
         return serial_emergency(self._port, [SerialMessage(STOP.decode(), "!", BOOT_S)])
 
     def close(self) -> None:
-        """Close the port; legal in any state."""
+        """Close the port. Legal in any state."""
         with suppress(*BROKEN):
             self._port.close()
 
@@ -133,7 +133,7 @@ class Conversation:
         n_stops = self._n_stops
 
         def unless_stopped() -> T | None:
-            if self._n_stops != n_stops:  # also the message of the stop is not for this wait
+            if self._n_stops != n_stops:  # the message of the stop is not for this wait either
                 raise DeviceError(self._device, "aborted by the safe state")
             return look()
 
@@ -157,7 +157,7 @@ class Conversation:
         return None
 
     def _pump(self, *, wait: bool) -> None:
-        """Read and sort the lines that came; with ``wait``, wait a little if nothing has."""
+        """Read and sort the lines that came. With ``wait``, wait a little if nothing came."""
         with self._unbroken():
             n_bytes = self._port.in_waiting
             came = self._port.read(min(max(1, n_bytes), MAX_BYTES)) if n_bytes or wait else b""
@@ -183,7 +183,7 @@ class Conversation:
             return f"{what}; is this the box's port, and does the box have labseq's firmware?"
         shown = clean(noise[:SHOWN_BYTES].decode("ascii", "backslashreplace"))
         what = f"no answer to '{question}' within {waited} but '{shown}'"
-        return f"{what}; expected a line that ends in its checksum; is this the box's port?"
+        return f"{what}, which is not a line with a checksum; is this the box's port?"
 
     @contextmanager
     def _unbroken(self) -> Generator[None]:
@@ -198,7 +198,7 @@ class Conversation:
 
 
 class Identity(NamedTuple):
-    """What the box reports about itself."""
+    """The box's report about itself."""
 
     serial_number: int
     """The number that it was given."""
@@ -209,20 +209,20 @@ class Identity(NamedTuple):
 
 
 class BoxState(NamedTuple):
-    """What the box is doing."""
+    """The box's present state."""
 
     boots: int
     """How often it has started."""
     runs: int
     """Programs played to their end since then, modulo 65536."""
     on: int
-    """What is on: bit n is channel n."""
+    """Channels that are on, bit n for channel n."""
     polarity: int
     """Outputs that are low when they are on."""
 
 
 class LeaderState(NamedTuple):
-    """What the box knows of a leader."""
+    """The box's state towards a leader."""
 
     state: int
     """``DEAF``, ``IDLE``, ``OWED`` or ``LATE``."""
@@ -241,17 +241,17 @@ class Box(Conversation):
         """Wait until the box answers, and check that it is one."""
         words = self._first_answer()
         if len(words) < 2 or words[0] != NAME:
-            text = f"'{clean(' '.join(words))}' answers; expected '{NAME}'; is this the right port?"
+            text = f"'{clean(' '.join(words))}' answers, not '{NAME}'; is this the right port?"
             raise DeviceError(self._device, text)
         (version,) = self._numbers(words[1:2], 1)
         if version != VERSION:
-            text = f"the box's firmware has version {version} of the protocol; expected {VERSION}"
+            text = f"the box's firmware has version {version} of the protocol, not {VERSION}"
             raise DeviceError(self._device, f"{text}; flash it again, see docs/how-to/timing-box.md")
         serial_number, boots, cause = self._numbers(words[2:], 3)
         return Identity(serial_number, boots, cause_text(cause))
 
     def state(self, tries: int = TRIES) -> BoxState:
-        """Read what it is doing; it does not answer while a program runs."""
+        """Read its present state. It does not answer while a program runs."""
         return BoxState(*self._numbers(self.ask("state", tries=tries)[1:], 4))
 
     def put(self, slot: int, edges: Sequence[Edge]) -> None:
@@ -275,15 +275,15 @@ class Box(Conversation):
         return boots
 
     def fire(self, *, external: bool = False) -> None:
-        """Play the program now, or at the next edge of the start input; the command is never repeated."""
+        """Play the program now, or at the next edge of the start input. The command is never repeated."""
         self.ask("await" if external else "fire", again=False)
 
     def lead(self, masks: Sequence[int], deadline_s: float) -> bool:
         """Accept a leader's edges from now on.
 
         Args:
-            masks: The outputs for busy, ready and failed; 0 for none.
-            deadline_s: Longest time from an edge to its answer; 0: any.
+            masks: The outputs for busy, ready and failed, 0 for none.
+            deadline_s: Longest time from an edge to its answer, 0 for any.
 
         Returns:
             Whether the start input is high.
@@ -293,12 +293,12 @@ class Box(Conversation):
         return bool(level)
 
     def answer_leader(self, *, is_ready: bool) -> tuple[int, bool]:
-        """Raise `ready` or `failed`; returns the state before, and whether an edge was refused meanwhile."""
+        """Raise `ready` or `failed`. Returns the state before, and whether an edge was refused meanwhile."""
         state, more_came = self._numbers(self.ask(f"answer {is_ready:d}"), 2)
         return state, bool(more_came)
 
     def leader(self) -> LeaderState:
-        """Read what it knows of a leader."""
+        """Read its state towards a leader."""
         return LeaderState(*self._numbers(self.ask("leader"), 4))
 
     def set_lines(self, mask: int) -> None:
@@ -306,7 +306,7 @@ class Box(Conversation):
         self.ask(f"set {mask:x}")
 
     def set_watchdog_timeout(self, timeout_s: float) -> None:
-        """Turn all lines off if nothing is received for this long; 0: never."""
+        """Turn all lines off if nothing is received for this long, 0 for never."""
         self.ask(f"timeout {round(timeout_s * 1e3):x}")
 
     def set_polarity(self, mask: int) -> None:
@@ -334,7 +334,7 @@ class Box(Conversation):
         except ValueError:
             numbers = []
         if len(numbers) != n:
-            text = f"the box answers '{clean(' '.join(words))}'; expected {n} hexadecimal numbers"
+            text = f"the box answers '{clean(' '.join(words))}', not {n} hexadecimal numbers"
             raise DeviceError(self._device, f"{text}; does it have labseq's firmware?")
         return numbers
 

@@ -1,4 +1,4 @@
-"""The timing box with an external control system: its start signal `go` is an edge at the start input."""
+"""The timing box with an external control system, whose start signal `go` is an edge."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from labseq_ttl.settings import GoSettings, TtlSettings
 
 LOOK_S: Final = 0.2
 """Time after which the box is asked, in case its message of an edge came damaged."""
-HIGH: Final = "the start input is high: not wired, or raised too early; its next rising edge counts"
+HIGH: Final = "the start input is high (not wired, or raised too early); its next rising edge counts"
 
 
 def ttl_lines(settings: TtlSettings, context: Context) -> TtlLines:
@@ -30,12 +30,12 @@ def ttl_lines(settings: TtlSettings, context: Context) -> TtlLines:
 
 
 class GoLines(TtlLines):
-    """A timing box that also connects to an external control system; implements ``labseq.plugin.LeaderLink``.
+    """A timing box with an external control system, as a ``labseq.plugin.LeaderLink``.
 
     The box itself detects the edge, raises `busy`, and keeps the deadline, also if labseq hangs or dies.
 
     Args:
-        go: What is wired to the external control system.
+        go: Outputs that are wired to the external control system.
     """
 
     def __init__(self, settings: TtlSettings, go: GoSettings, context: Context) -> None:
@@ -50,7 +50,7 @@ class GoLines(TtlLines):
         return self._go.deadline
 
     def close(self) -> None:
-        """Answer a `go` that waits for an answer, turn all lines off and disconnect; legal in any state."""
+        """Answer a waiting `go`, turn all lines off and disconnect. Legal in any state."""
         try:
             self.safe_state()
             if self._box is not None:
@@ -60,7 +60,7 @@ class GoLines(TtlLines):
             self._disconnect()
 
     def wait_for(self, signal: str, timeout_s: float) -> str:
-        """Wait for `go`; see ``labseq.plugin.LeaderLink``.
+        """Wait for `go` (see ``labseq.plugin.LeaderLink``).
 
         Raises:
             DeviceError: Not open, another signal, or the box was reset.
@@ -80,16 +80,16 @@ class GoLines(TtlLines):
         return ""
 
     def report(self, state: str, about: Mapping[str, Any]) -> str:
-        """Raise `ready` or `failed`; see ``labseq.plugin.LeaderLink``.
+        """Raise `ready` or `failed` (see ``labseq.plugin.LeaderLink``).
 
         Raises:
-            DeviceError: Not open, or the box does not answer: it raises `failed` itself at the deadline.
+            DeviceError: Not open, or the box does not answer. It raises `failed` itself at the deadline.
         """
         del about  # an edge carries no more than that
         if not self._is_owed:
             return ""
         box = self._opened()
-        self._clock.check()  # a stop now is better than one between `ready` and its confirmation
+        self._clock.check()  # a stop now is better than between `ready` and its confirmation
         was, more_came = box.answer_leader(is_ready=state == "ready")
         self._is_owed = False
         if more_came:
@@ -134,5 +134,5 @@ class GoLines(TtlLines):
 
     def _no_go(self, timeout_s: float, *, is_high: bool) -> DeviceTimeoutError:
         what = f"no rising edge at the box's start input within {format_quantity(timeout_s, 'time')}"
-        why = "it is high: not wired, or raised before labseq was ready" if is_high else "it is low"
-        return DeviceTimeoutError(self._name, f"{what}; {why}; see 'timeout' of the wait", timeout_s)
+        why = "it is high, so it is not wired or was raised too early" if is_high else "it is low"
+        return DeviceTimeoutError(self._name, f"{what} ({why}); see 'timeout' of the wait", timeout_s)

@@ -39,7 +39,7 @@ from labseq_ttl.protocol import (
 from labseq_ttl.settings import TtlSettings
 
 LATENCY_S: Final = 0.4e-3
-"""From the end of ``fire`` on the line to the first edge, without the computer's own delays."""
+"""Delay from the end of ``fire`` on the line to the first edge, without the computer's own delays."""
 
 BEATS_PER_TIMEOUT: Final = 4
 """How often the box receives something within its watchdog timeout."""
@@ -64,7 +64,7 @@ class TtlLines(Lines):
     Calls raise ``DeviceError`` if the box is not open, does not answer, was reset, or plays a program.
 
     Attributes:
-        access: How the driver gets to the box.
+        access: The driver's access to the box.
     """
 
     def __init__(self, settings: TtlSettings, context: Context) -> None:
@@ -94,7 +94,7 @@ class TtlLines(Lines):
 
         Raises:
             ConfigError: A line is on a channel that the box does not have.
-            DeviceError: It does not answer, or is not the one that the profile names.
+            DeviceError: It does not answer, or is not the box in the profile.
         """
         if self._box is not None:
             return
@@ -112,14 +112,14 @@ class TtlLines(Lines):
         self.access.lines_set(idle)
 
     def close(self) -> None:
-        """Turn all lines off and disconnect; legal in any state."""
+        """Turn all lines off and disconnect. Legal in any state."""
         try:
             self.safe_state()
         finally:
             self._disconnect()
 
     def safe_state(self) -> None:
-        """Turn all lines off, whatever the box is doing; if that fails, once more on a new connection.
+        """Turn all lines off, whatever the box is doing. If that fails, try again on a new connection.
 
         Raises:
             DeviceError: The box does not confirm it.
@@ -138,7 +138,7 @@ class TtlLines(Lines):
         self.access.lines_set(off_program(self._specs))
 
     def emergency(self) -> Emergency | None:
-        """The byte that turns all lines off; a box that is reset by the opening of its port does so too."""
+        """The byte that turns all lines off, as the reset of a box at the opening of its port does too."""
         return None if self._box is None else self._box.emergency()
 
     def check_program(self, program: LineProgram) -> None:
@@ -150,7 +150,7 @@ class TtlLines(Lines):
         edges_of(program, self._specs, self._name)
 
     def compile(self, program: LineProgram) -> None:
-        """Take a program for the next firing; one that the box stores already is not sent again.
+        """Take a program for the next firing. A program that the box stores already is not sent again.
 
         Raises:
             LimitError: More edges, or closer together, than the box can make.
@@ -181,7 +181,7 @@ class TtlLines(Lines):
         self._is_armed = True
 
     def fire(self) -> None:
-        """Start the program, or let the start input start it; returns at once."""
+        """Start the program, or let the start input start it, and return at once."""
         box = self._opened()
         if not self._is_armed or self._compiled is None:
             raise DeviceError(self._name, "fired, but not armed; call arm() before each fire()")
@@ -212,7 +212,7 @@ class TtlLines(Lines):
         box.put(slot, written)
         for i, edge in enumerate(written):
             if (read := box.get(slot, i)) != edge:
-                raise DeviceError(self._name, f"edge {i} in slot {slot} reads {read}; expected {edge}")
+                raise DeviceError(self._name, f"edge {i} in slot {slot} reads {read}, not {edge}")
         on = box.state().on
         box.put(slot, ((0, on), (TEST_TICKS, on)))
         box.arm(slot, 2)
@@ -223,7 +223,7 @@ class TtlLines(Lines):
         took_s = time.monotonic() - started_s
         if event is None or event[0] != "done":
             sent = "nothing" if event is None else " ".join(event)
-            raise DeviceError(self._name, f"at the end of a program the box sends '{sent}'; expected 'done'")
+            raise DeviceError(self._name, f"at the end of a program the box sends '{sent}', not 'done'")
         if self.access.real_time and took_s < TOO_FAST * expected_s:
             text = (
                 f"the box played {format_quantity(expected_s, 'time')} in {format_quantity(took_s, 'time')}"
@@ -261,7 +261,7 @@ class TtlLines(Lines):
     def _check_serial_number(self, found: int) -> None:
         expected = self._settings.serial_number
         if self.access.real_time and expected is not None and expected != found:
-            text = f"the box at {self._settings.port} has the serial number {found}; expected {expected}"
+            text = f"the box at {self._settings.port} has the serial number {found}, not {expected}"
             raise DeviceError(self._name, f"{text}; is this the right port?")
 
     def _start_watchdog(self, box: Box) -> None:
@@ -302,7 +302,7 @@ class TtlLines(Lines):
             self._handle(event)
             if not self._is_running:
                 return
-        with suppress(DeviceTimeoutError):  # perhaps the message of the end was damaged
+        with suppress(DeviceTimeoutError):  # the message of the end may have been damaged
             state = box.state(tries=1)
             if state.boots != self._n_boots:
                 self._was_reset(state.boots)
@@ -331,7 +331,7 @@ class TtlLines(Lines):
             self._forget()
             silent = format_quantity(self._settings.watchdog_timeout, "time")
             text = f"the box heard nothing for {silent} and turned all lines off"
-            raise DeviceError(self._name, f"{text}; is this computer too busy? raise 'watchdog_timeout'")
+            raise DeviceError(self._name, f"{text}; raise 'watchdog_timeout' if this computer is too busy")
 
     def _has_ended(self, n_runs: int) -> None:
         self._is_running, self._n_runs = False, n_runs
@@ -348,7 +348,7 @@ class Heartbeat(threading.Thread):
     """Sends something to a box regularly, so that its watchdog does not turn all lines off.
 
     Args:
-        beat: Sends it; it may fail, for the driver's next command finds out why.
+        beat: Sends it. It may fail, since the driver's next command finds out why.
         timeout_s: The box's watchdog timeout.
     """
 
@@ -365,7 +365,7 @@ class Heartbeat(threading.Thread):
                 self._beat()
 
     def stop(self) -> None:
-        """Stop; returns when the thread has ended."""
+        """Stop, and return when the thread has ended."""
         self._stopped.set()
         self.join()
 

@@ -11,7 +11,7 @@ from labseq.plugin import LimitError, LineProgram, LineSpec, format_quantity
 from labseq_ttl.protocol import EDGES, LONGEST, SHORTEST, SLOTS, TICK_S, Edge
 
 MAX_EDGES: Final = EDGES - 1
-"""Edges of a program; one more marks its end."""
+"""Edges of a program. One more marks its end."""
 
 
 def edges_of(program: LineProgram, specs: Sequence[LineSpec], device: str) -> tuple[Edge, ...]:
@@ -42,17 +42,17 @@ class Slots:
     """The slots of the box, and the programs that they hold."""
 
     def __init__(self) -> None:
-        self._slot_of: dict[tuple[Edge, ...], int] = {}  # the one used last comes last
+        self._slot_of: dict[tuple[Edge, ...], int] = {}  # the last used slot comes last
 
     def find(self, edges: tuple[Edge, ...]) -> int | None:
-        """The slot of a program, which is used now; None if no slot holds it."""
+        """The slot of a program, which is used now, None if no slot holds it."""
         slot = self._slot_of.pop(edges, None)
         if slot is not None:
             self._slot_of[edges] = slot
         return slot
 
     def free(self) -> int:
-        """A slot for a new program, if need be that of the program that was not used for the longest time."""
+        """A slot for a new program, if all are full the slot that was not used for the longest time."""
         if len(self._slot_of) < SLOTS:
             return min({*range(SLOTS)} - {*self._slot_of.values()})
         return self._slot_of.pop(next(iter(self._slot_of)))
@@ -67,13 +67,13 @@ class Slots:
 
 
 def mask_of(row: Sequence[bool], specs: Sequence[LineSpec]) -> int:
-    """The lines that are on, as the box counts them: bit n is channel n. ``open`` refuses other channels."""
+    """The lines that are on, with bit n for channel n. ``open`` refuses other channels."""
     channels = [spec.channel for spec, is_on in zip(specs, row, strict=True) if is_on]
     return sum(1 << channel for channel in channels if isinstance(channel, int))
 
 
 def _edge(program: LineProgram, i: int) -> str:
-    """Describe an edge: the lines that change, and when."""
+    """Describe an edge by the lines that change, and its time."""
     now = program.on[i]
     before = program.on[i - 1] if i else np.zeros_like(now)
     names = ", ".join(f"'{line}'" for line, new in zip(program.lines, now != before, strict=True) if new)

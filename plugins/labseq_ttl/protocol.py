@@ -42,7 +42,7 @@ PER_LINE: Final = 5
 """Edges that fit on a line, however long their numbers are."""
 
 DEAF: Final = 0
-"""State of the box towards a leader: it ignores the start input."""
+"""State of the box towards a leader in which it ignores the start input."""
 
 IDLE: Final = 1
 """It waits for `go`."""
@@ -51,14 +51,14 @@ OWED: Final = 2
 """`go` came, and needs an answer."""
 
 LATE: Final = 3
-"""The deadline of the answer has passed: the leader received `failed`."""
+"""The deadline of the answer has passed, so the leader received `failed`."""
 
 Edge: TypeAlias = tuple[int, int]
-"""Ticks since the edge before, and what is on from then on: bit n is channel n."""
+"""Ticks since the edge before, and the channels that are on from then on, bit n for channel n."""
 
 
 def checksum(text: bytes) -> int:
-    """CRC-16/IBM-3740 (also known as CCITT-FALSE): polynomial 0x1021, begun with 0xFFFF.
+    """CRC-16/IBM-3740 (also known as CCITT-FALSE), with polynomial 0x1021, begun with 0xFFFF.
 
     Example:
         >>> hex(checksum(b"123456789"))
@@ -78,7 +78,7 @@ def framed(text: str) -> bytes:
 
 
 def unframed(line: bytes) -> str | None:
-    """The text of a line; None if it is damaged.
+    """The text of a line, None if it is damaged.
 
     Args:
         line: Without its end.

@@ -30,11 +30,11 @@ Channel: TypeAlias = Annotated[int, AfterValidator(_is_output)]
 
 
 class GoSettings(LeaderSettings):
-    """An external control system: `go` is a rising edge at the start input (D8), outputs answer."""
+    """An external control system, whose `go` is a rising edge at the start input (D8). Outputs answer."""
 
     deadline: Annotated[Duration, Field(ge=0.1, le=MAX_DEADLINE_S)] = Field(
         default=10.0,
-        description="longest time from `go` to `ready` or `failed`; the box keeps it, also without labseq",
+        description="longest time from `go` to `ready` or `failed`, which the box keeps even without labseq",
     )
     busy: Channel | None = Field(
         default=None, description="output that is high from `go` to the end of the shot"
@@ -49,13 +49,13 @@ class GoSettings(LeaderSettings):
 
     @property
     def outputs(self) -> dict[str, int]:
-        """Name -> channel of those that are wired."""
+        """Name -> channel of each output that is wired."""
         pins = {"busy": self.busy, "ready": self.ready, "failed": self.failed}
         return {name: pin for name, pin in pins.items() if pin is not None}
 
     @property
     def polarity(self) -> int:
-        """Those that are low when they are on: bit n is channel n."""
+        """Outputs that are low when they are on, bit n for channel n."""
         return sum(1 << pin for pin in self.outputs.values()) if self.active_low else 0
 
     @model_validator(mode="after")
@@ -78,20 +78,20 @@ class TtlSettings(Settings):
     port: str = Field(
         default=SIMULATED,
         min_length=1,
-        description='serial port of the box, "/dev/ttyACM0"; `simulated`: a box that is simulated',
+        description='serial port of the box, "/dev/ttyACM0", or `simulated` for a simulated box',
     )
     serial_number: Annotated[int, Field(ge=0, le=0xFFFF)] | None = Field(
-        default=None, description="serial number that the box must have; none: any"
+        default=None, description="serial number that the box must have, or none for any"
     )
     start: Literal["serial", "external"] = Field(
         default="serial",
-        description="what starts a program that was fired: the serial line, or the next rising edge at the "
+        description="what starts a program that was fired, the serial line or the next rising edge at the "
         "box's start input",
     )
     watchdog_timeout: Annotated[Duration, Field(le=MAX_WATCHDOG_S)] = Field(
         default=2.0,
         description="how long the box waits for a sign of life from labseq before it turns all lines off, "
-        "while no program runs; 0: for ever",
+        "while no program runs, or 0 for ever",
     )
     go: GoSettings | None = Field(
         default=None,
@@ -105,7 +105,7 @@ class TtlSettings(Settings):
         return self.port == SIMULATED
 
     def identities(self) -> tuple[str, ...]:
-        """What only one process can use of it."""
+        """Names of the box, which only one process can use."""
         number = () if self.serial_number is None else (f"timing box {self.serial_number}",)
         return () if self.is_simulated else (*port_identities(self.port), *number)
 

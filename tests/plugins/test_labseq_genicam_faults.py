@@ -25,7 +25,7 @@ rig = partial(opened_rig, "genicam")
 
 LARGE = (512, 512)
 """A sensor whose frames have so many packets that some of a failed one always come."""
-GONE = "camera: the camera is gone: it does not answer; check its cable and power"
+GONE = "camera: the camera no longer answers; check its cable and power"
 
 
 def opening(**settings: Any) -> DeviceError | LimitError:

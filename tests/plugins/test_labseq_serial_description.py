@@ -60,7 +60,7 @@ a:
         ("COM3", "socket://localhost:99999", "3:9: 'socket://localhost:99999' is not a port; expected"),
         ('"\\r"', "'\\r'", "4:20: '\\r' holds a backslash; expected control characters"),
         ("OUT 0,", "ÖUT 0,", "8:17: 'ÖUT 0' is not ascii; expected another 'encoding', or other characters"),
-        ("OUT 0,", '"OUT 0\\r",', "8:17: 'OUT 0\\r' holds what ends a command; expected it without"),
+        ("OUT 0,", '"OUT 0\\r",', "8:17: 'OUT 0\\r' contains the end of a command; leave it out"),
         # templates and their arguments
         (
             "{f:.1f}",
@@ -94,7 +94,7 @@ a:
         (
             "reply: OK, ",
             "",
-            "8:24: 'error' is about a reply, but no 'reply' is waited for; expected a",
+            "8:24: 'error' is about a reply, but there is no 'reply'; expected a",
         ),
         ("reply: OK", "reply: OK, example: NO", "8:44: the reply 'NO' does not match; expected one like"),
         (

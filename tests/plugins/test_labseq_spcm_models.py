@@ -60,7 +60,7 @@ class TestFourOutputs:
                 {"card": "TCPIP::192.168.1.10::inst0", "mode": "stream"},
                 "2.5 GB/s, which the network to TCPIP",
             ),
-            ({"card": "TCPIP::192.168.1.10::inst0", "mode": "fifo"}, "use mode: replay"),
+            ({"card": "TCPIP::192.168.1.10::inst0", "mode": "fifo"}, "use `mode: replay`"),
         ],
     )
     def test_and_what_cannot_be_is_refused_in_the_profile(self, settings: dict[str, Any], text: str) -> None:

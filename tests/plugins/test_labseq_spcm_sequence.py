@@ -217,7 +217,7 @@ def test_a_card_without_the_mode_is_refused(driver: Any, monkeypatch: pytest.Mon
     read = SimulatedCard.read
     without = {r.SPC_PCIFEATURES: (0, 0)}
     monkeypatch.setattr(SimulatedCard, "read", lambda card, reg: without.get(reg) or read(card, reg))
-    with pytest.raises(DeviceError, match=r"no sequence mode .*; use mode: replay"), driver("sequence"):
+    with pytest.raises(DeviceError, match=r"no sequence mode .*; use `mode: replay`"), driver("sequence"):
         pass
 
 
