@@ -1,4 +1,4 @@
-"""Cameras that Aravis reaches: opening one, its errors, and the acquisition of its frames."""
+"""Cameras that Aravis reaches, with their errors and the acquisition of their frames."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ HINTS: Final = {
     "not found": "check its cable, power and network address. To try things without a camera, set "
     "`camera: simulated`",
 }
-"""What to do, by the code of an error."""
+"""Remedy, by the code of an error."""
 
 INCOMPLETE: Final = "some of its network packets are missing"
 FAULTS: Final[Mapping[str, str]] = {"success": "", "missing packets": INCOMPLETE, "timeout": INCOMPLETE}
-"""What is wrong with a frame, by the status of its buffer."""
+"""Fault of a frame, by the status of its buffer."""
 
 CHECK_PERIOD_S: Final = 0.5
 """Time without a frame after which the driver checks whether the camera still answers, in seconds."""
 
 BUFFER_BYTES: Final = 256 * 2**20
-"""Memory for frames that were not read yet; a series that needs more reuses its buffers."""
+"""Memory for frames that were not read yet. A series that needs more reuses its buffers."""
 
 LAST_ID: Final = 65535
 """GigE cameras count frames from 1 to this and continue with 1, unless they use 64 bits."""
@@ -64,11 +64,11 @@ def simulated_settings() -> dict[str, str | None] | str:
 
 
 def buffer_note(payload: int, room: int) -> str:
-    """What to do where a frame of ``payload`` bytes may be more than a socket holds; empty where it is not.
+    """Remedy where a frame of ``payload`` bytes may be more than a socket holds, else empty.
 
     Args:
         payload: Size of a frame, in bytes.
-        room: Bytes that a socket gets; the kernel counts packets at up to twice their size.
+        room: Bytes that a socket gets. The kernel counts packets at up to twice their size.
     """
     if room >= 2 * payload:
         return ""
@@ -111,8 +111,8 @@ class AravisConnection(Connection):
     again can take as long as an exposure. Late frames of an earlier series are recognised by their numbers.
 
     Attributes:
-        camera: Aravis' camera; None unless it is open.
-        packet_size: Bytes of a network packet; None as the camera is set.
+        camera: Aravis' camera, None unless it is open.
+        packet_size: Bytes of a network packet, None to leave the camera's.
     """
 
     def __init__(self, settings: GenicamSettings, context: Context) -> None:
@@ -159,7 +159,7 @@ class AravisConnection(Connection):
         camera, delay_s = self._opened(), self._settings.packet_delay
         for key, value in (("packet_size", self.packet_size), ("packet_delay", delay_s)):
             if value is not None and not camera.is_ethernet:
-                raise DeviceError(features.name, f"only GigE cameras have packets: leave out `{key}`")
+                raise DeviceError(features.name, f"only GigE cameras have packets; leave out `{key}`")
         with self.doing("set its network packets"):
             if self.packet_size is not None:
                 camera.set_packet_size(self.packet_size)
@@ -172,11 +172,11 @@ class AravisConnection(Connection):
             return {"packet_size_now": camera.packet_size, "notes": [*filter(None, [self._buffer_note])]}
 
     def granted(self, n_bytes: int) -> int:
-        """Bytes that a socket gets which requests ``n_bytes``."""
+        """Bytes that a socket gets when it requests ``n_bytes``."""
         return granted(n_bytes)
 
     def close(self) -> None:
-        """Release the camera; repeatable. If it is gone this takes the library 10 s, so a thread does it."""
+        """Release the camera. Repeatable. If it is gone this takes the library 10 s, so a thread does it."""
         camera, self.camera = self.camera, None
         self._stream = self._trigger = None  # the camera closes its stream
         if camera is None:
@@ -264,7 +264,7 @@ class AravisConnection(Connection):
             self.stop()
 
     def stop(self) -> None:
-        """End the acquisition; frames that were not read are dropped, including those being transferred."""
+        """End the acquisition. Unread frames are dropped, including frames being transferred."""
         stream, trigger = self._stream, self._trigger
         self._stream = self._trigger = None
         if self._is_gone:
@@ -276,7 +276,7 @@ class AravisConnection(Connection):
             stream.close()
 
     def _has_all_frames(self) -> bool:
-        """Whether all triggered frames have come; those that were not read are dropped."""
+        """Whether all triggered frames have come. Unread frames are dropped."""
         while (buffer := self._pop(0.0)) is not None:
             self._counter.number(buffer.frame_id if buffer.image is not None else None)
         return self._counter.n_frames == self._n_triggered
@@ -318,7 +318,7 @@ class FrameCounter:
         self._last: tuple[int, int] | None = None
 
     def number(self, frame_id: int | None) -> int:
-        """Number, from 0, of the frame that has just come; its id is None if it is incomplete."""
+        """Number, from 0, of the frame that has just come. Its id is None if it is incomplete."""
         number = self.n_frames
         if frame_id is not None and self._last is not None:
             last_number, last_id = self._last

@@ -26,7 +26,7 @@ class GenicamCamera(StandardCamera):
         super().__init__(settings, context, connection_for(settings, context))
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
-        """Those of libaravis and the camera; no real camera was tried."""
+        """Versions of libaravis and the camera. No real camera was tried."""
         return {
             "libaravis": (library_version(), "0.8.26"),
             "firmware": (self.reported.get("firmware", ""), ""),

@@ -1,4 +1,4 @@
-"""The connection to a camera: what differs between the libraries, and between real and simulated cameras."""
+"""Connection to a camera, which differs between libraries and between real and simulated cameras."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ class Connection(ABC):
 
     @abstractmethod
     def open(self) -> Nodes:
-        """Find the camera, open it and end any acquisition; returns the access to its features."""
+        """Find the camera, open it and end any acquisition. Returns the access to its features."""
 
     @abstractmethod
     def identity(self) -> Mapping[str, Any]:
-        """Model, serial number and connection of the open camera, and others that it reports: JSON-ready."""
+        """Model, serial number, connection and other facts of the open camera, JSON-ready."""
 
     @abstractmethod
     def set_packets(self, features: Features) -> Mapping[str, Any]:
-        """Set the network packets as the settings say; returns what the camera reports."""
+        """Set the network packets as the settings say, and return the camera's report."""
 
     @abstractmethod
     def close(self) -> None:
-        """Release everything; legal in any state."""
+        """Release everything. Legal in any state."""
 
     @abstractmethod
     def doing(self, what: str) -> AbstractContextManager[object]:
-        """Turn errors of the library into errors of labseq; ``what`` completes "cannot ..."."""
+        """Turn errors of the library into errors of labseq. ``what`` completes "cannot ..."."""
 
     @abstractmethod
     def check_alive(self) -> None:
@@ -57,8 +57,8 @@ class Connection(ABC):
 
     # the library's part of a series
 
-    def goes_on(self, trigger: Trigger) -> bool:  # noqa: ARG002 - for those that override it
-        """Whether the acquisition of the last series serves the next one, too; else it is ended."""
+    def goes_on(self, trigger: Trigger) -> bool:  # noqa: ARG002 - for overriding methods
+        """Whether the acquisition of the last series serves the next one, too. If not, it is ended."""
         return False
 
     @abstractmethod
@@ -74,20 +74,20 @@ class Connection(ABC):
 
     @abstractmethod
     def poll(self, seconds: float) -> ExposureResult | None:
-        """Wait for the next frame of the series, for at most ``seconds``; None if none came."""
+        """Wait for the next frame of the series, for at most ``seconds``. None if none came."""
 
     def end(self) -> None:
-        """End the series; the acquisition may go on for the next one."""
+        """End the series. The acquisition may go on for the next one."""
         self.stop()
 
     @abstractmethod
     def stop(self) -> None:
-        """End the acquisition; frames that were not read are dropped."""
+        """End the acquisition. Unread frames are dropped."""
 
-    # how exposures start; a simulated camera makes its own pictures
+    # how exposures start, which simulated cameras override with their own pictures
 
     def trigger_of(self, series: Series) -> Trigger:
-        """What starts the camera's exposures in a series."""
+        """Trigger of the camera's exposures in a series."""
         return series.trigger
 
     def arm(self, series: Series, period_s: float) -> None:
@@ -95,7 +95,7 @@ class Connection(ABC):
 
         Args:
             series: The series.
-            period_s: From one exposure to the next where the camera times them, in seconds; else nan.
+            period_s: Time from one exposure to the next where the camera times them, in seconds, else nan.
         """
 
     def trigger(self) -> None:
@@ -104,7 +104,7 @@ class Connection(ABC):
         self.fire()
 
     def wait(self, timeout_s: float) -> ExposureResult | None:
-        """Wait for a frame on the session's clock; None if none came in time."""
+        """Wait for a frame on the session's clock. None if none came in time."""
         return wait_for(self.poll, timeout_s, self._clock)
 
     def clear(self) -> None:

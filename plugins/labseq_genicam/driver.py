@@ -1,4 +1,4 @@
-"""The driver: a camera with the features of the GenICam standard, whatever library reaches it."""
+"""The driver of a camera with the features of the GenICam standard, for any library."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class StandardCamera(CameraDriver):
 
     Attributes:
         connection: The library's access to the camera, or to a simulated one.
-        features: The features of the camera; None unless it is open.
+        features: The features of the camera, None unless it is open.
     """
 
     model_name: ClassVar[str]
-    """What the camera is called until it has reported its model."""
+    """Name of the camera until it has reported its model."""
 
     def __init__(self, settings: StandardSettings, context: Context, connection: Connection) -> None:
         super().__init__(context, settings.orientation)
@@ -45,7 +45,7 @@ class StandardCamera(CameraDriver):
 
     @property
     def facts(self) -> CameraFacts:
-        """Read-out time of the settings; bounds of exposures and frame shape as soon as they are known."""
+        """Read-out time of the settings, and bounds of exposures and frame shape once they are known."""
         settings, connection = self._settings, self.connection
         shape = self.reported.get("frame_shape") or settings.frame_shape(connection.sensor_shape)
         known = connection.min_exposure_s, settings.max_exposure
@@ -58,7 +58,7 @@ class StandardCamera(CameraDriver):
         self.connection.warm()
 
     def describe(self) -> Mapping[str, Any]:
-        """Settings; once opened, also what the camera reports, now its exposure and temperature too."""
+        """Settings, and once opened also the camera's report with its present exposure and temperature."""
         described = {**self._settings.model_dump(mode="json"), "model": self.model_name, **self.reported}
         if self.features is not None:
             described["exposure_now_s"] = read_exposure_s(self.features)
@@ -95,7 +95,7 @@ class StandardCamera(CameraDriver):
         connection.start(series, trigger)
 
     def _set_trigger(self, features: Features, trigger: Trigger, n_frames: int) -> None:
-        """Choose what starts the exposures, unless that is set already: it takes tens of commands.
+        """Choose the trigger of the exposures, which takes tens of commands, unless it is set already.
 
         Where the camera times them it is set again, since the last frame rate would limit the exposure time.
         """

@@ -15,7 +15,7 @@ Number = TypeVar("Number", int, float)
 
 
 class Nodes(Protocol):
-    """How a library reads and sets features: texts and enumerations as str, others as bool, int or float.
+    """A library's access to features. Texts and enumerations are str, others bool, int or float.
 
     Each method but the first two fails if the camera does not have the feature.
     """
@@ -25,7 +25,7 @@ class Nodes(Protocol):
         ...
 
     def options(self, feature: str) -> tuple[str, ...]:
-        """Values of an enumeration that can be chosen; none if the camera does not have it."""
+        """Values of an enumeration that can be chosen, none if the camera does not have it."""
         ...
 
     def get(self, feature: str, kind: type[Value]) -> Value:
@@ -46,12 +46,12 @@ class Nodes(Protocol):
 
 
 class Features:
-    """Sets features, and says what the camera can do where it cannot do what the settings ask for.
+    """Sets features, and names the camera's limits where the settings exceed them.
 
     Args:
         name: Name of the camera in the profile, for errors.
         nodes: The library's access to the camera.
-        doing: Turns errors of the library within its block into errors of labseq; its argument completes
+        doing: Turns errors of the library within its block into errors of labseq. Its argument completes
             "cannot ...".
     """
 
@@ -63,7 +63,7 @@ class Features:
         self._doing = doing
 
     def find(self, *features: str) -> str:
-        """The first of these features that the camera offers now; empty if it offers none.
+        """The first of these features that the camera offers now, empty if it offers none.
 
         The name in the standard comes first, then those of older cameras.
         """
@@ -77,7 +77,7 @@ class Features:
         raise DeviceError(self.name, f"the camera has no {what} (no feature {one_of(features)}); {hint}")
 
     def options(self, feature: str) -> tuple[str, ...]:
-        """Values of an enumeration that can be chosen; none if the camera does not have it."""
+        """Values of an enumeration that can be chosen, none if the camera does not have it."""
         with self._doing(f"read what its {feature} can be"):
             return self._nodes.options(feature)
 
@@ -102,7 +102,7 @@ class Features:
                 self._nodes.set(feature, is_on)
 
     def read(self, kind: type[Value], *features: str) -> Value | None:
-        """Value of the first of these features that the camera offers; None if it offers none."""
+        """Value of the first of these features that the camera offers, None if it offers none."""
         feature = self.find(*features)
         with self._doing(f"read its {feature}"):
             return self._nodes.get(feature, kind) if feature else None
@@ -118,7 +118,7 @@ class Features:
             return self._nodes.bounds(feature, float)
 
     def set_integer(self, what: str, feature: str, value: int, unit: int = 1) -> None:
-        """Set an integer; ``value`` and its limits in errors are in units of ``unit``, the binning."""
+        """Set an integer. ``value`` and its limits in errors are in units of ``unit``, the binning."""
         check_step(f"{self.name}: {what}", value, self.integer_bounds(feature), unit)
         with self._doing(f"set its {what}"):
             self._nodes.set(feature, int(value) // unit)
@@ -126,7 +126,7 @@ class Features:
     def set_float(
         self, what: str, feature: str, value: float, say: Callable[[float], str] = "{:g}".format
     ) -> float:
-        """Set a float; returns the value that the camera accepted. ``say`` formats it in errors."""
+        """Set a float, and return the value that the camera accepted. ``say`` formats it in errors."""
         low, high = self.float_bounds(feature)
         if not low <= value <= high:
             limit = f"{say(low)} to {say(high)}, which the camera can do"

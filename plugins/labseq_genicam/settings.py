@@ -20,7 +20,7 @@ SIMULATED: Final = "simulated"
 
 
 class StandardSettings(CameraSettings):
-    """What can be set at every camera with the features of the GenICam standard."""
+    """Settings of every camera with the features of the GenICam standard."""
 
     camera: str | None = Field(
         default=None, min_length=1, description="which camera, or none for the only one connected"
@@ -91,13 +91,13 @@ class StandardSettings(CameraSettings):
         y, x, height, width = self.mode.region or (0, 0, *sensor_shape)
         if y + height > sensor_shape[0] or x + width > sensor_shape[1]:
             end, size = f"row {y + height}, column {x + width}", "{} x {} pixels".format(*sensor_shape)
-            hint = "choose a smaller or another one"
+            hint = "choose a smaller or another region"
             raise LimitError(f"{name}: end of the region", end, f"the sensor's {size}", hint)
         return y, x, height, width
 
 
 class FaultSettings(Settings):
-    """Failures of the simulated camera; none by default."""
+    """Failures of the simulated camera, by default none."""
 
     packet_loss: Fraction = Field(
         default=0.0, description="fraction of the network packets of frames that are never sent"
@@ -134,5 +134,5 @@ class GenicamSettings(StandardSettings):
     faults: FaultSettings = Field(default=FaultSettings(), description="failures of the simulated camera")
 
     def identities(self) -> tuple[str, ...]:
-        """What only one process can use of it."""
+        """Names of the camera, which only one process can use."""
         return () if self.camera == SIMULATED else (f"GenICam camera {self.camera or '(the only one)'}",)

@@ -1,4 +1,4 @@
-"""What simulated cameras have in common: exposures of the simulation, on the session's clock."""
+"""Exposures of the simulation for all simulated cameras, on the session's clock."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ MAX_WAIT_S: Final = 5.0
 class SimulatedExposures(Connection):
     """Gives the exposures of the simulation to a simulated camera, and waits until their frames are due.
 
-    It stands before the connection of a library among the base classes. The internal trigger and the edges of
-    lines in the simulation become software triggers, each at its time and with its picture: the simulated
-    cameras do not wait for a virtual clock, and nothing is connected to their lines.
+    It comes before the connection of a library among the base classes. The internal trigger and the edges of
+    lines in the simulation become software triggers, each at its time and with its picture, because the
+    simulated cameras do not wait for a virtual clock and nothing is connected to their lines.
     """
 
     late_s = 0.0
@@ -38,15 +38,15 @@ class SimulatedExposures(Connection):
 
     @abstractmethod
     def show(self, frame: Frame) -> None:
-        """Let the camera take a frame: give it the picture, and trigger it."""
+        """Give the camera the picture of a frame, and trigger it."""
 
     def warm(self) -> None:
-        """Compute what all frames have in common."""
+        """Compute the common part of all frames."""
         super().warm()
         self._world.prepare_sensor(self._settings.mode)
 
     def trigger_of(self, series: Series) -> Trigger:
-        """What starts the camera's exposures: the software, unless edges are expected that never come."""
+        """The software as trigger, unless edges are expected that never come."""
         is_real = series.trigger not in ("software", "internal") and not self._is_wired
         return series.trigger if is_real else "software"
 
@@ -68,7 +68,7 @@ class SimulatedExposures(Connection):
     def expose(self, t_s: float | None, exposure_s: float | None) -> None:
         """Begin an exposure, now or in its turn if no time of the session's clock is given."""
         if self._series is None or self._n_exposed == self._series.n_frames:
-            return  # an edge too many
+            return  # an extra edge
         self.wait_until_ready()
         frame = self._sensor.expose(self.late_s, t_s, exposure_s)
         if frame is not None:
@@ -104,7 +104,7 @@ class SimulatedExposures(Connection):
         self._n_due += self._due is not None
 
     def _start_s(self, number: int) -> float:
-        """When the exposure of a received frame began, on the session's clock; nan if unknown."""
+        """When the exposure of a received frame began, on the session's clock, nan if unknown."""
         while self._n_due <= number < self._n_exposed:  # the frames before it never came
             self._take_due(math.inf)
         frame, self._due = self._due, None

@@ -1,4 +1,4 @@
-"""What is set at a camera, in the order of the GenICam Standard Features Naming Convention (SFNC).
+"""Settings of a camera, in the order of the GenICam Standard Features Naming Convention (SFNC).
 
 The names of older cameras follow those of the standard.
 """
@@ -23,8 +23,8 @@ SERIES: Final = {
     "FrameBurstStart": "AcquisitionBurstFrameCount",
     "AcquisitionStart": "AcquisitionFrameCount",
 }
-"""Triggers that start a series, each with the feature for its number of frames: the first that a camera has
-is used."""
+"""Triggers that start a series, each with the feature for its number of frames. The camera's first one is
+used."""
 
 TIMED_BY_CAMERA: Final = frozenset[Trigger]({"internal", "external_start"})
 """Triggers with which the camera starts exposures by itself."""
@@ -35,15 +35,15 @@ ROUNDING: Final = 1e-6
 def set_up(
     features: Features, settings: StandardSettings, sensor_shape: tuple[int, int] | None
 ) -> dict[str, Any]:
-    """Set what stays the same from series to series, whatever state the camera is in.
+    """Set everything that stays the same from series to series, whatever state the camera is in.
 
     Args:
-        features: Those of the camera.
-        settings: What to set.
-        sensor_shape: (height, width) of the sensor; None: as the camera reports.
+        features: Features of the camera.
+        settings: Settings of the driver.
+        sensor_shape: (height, width) of the sensor, None for the camera's report.
 
     Returns:
-        The resulting settings: JSON-ready.
+        The resulting settings, JSON-ready.
     """
     for auto in ("ExposureAuto", "GainAuto", "AcquisitionFrameRateAuto"):
         features.choose_if_offered(auto, "Off")
@@ -71,7 +71,7 @@ def set_up(
 
 
 def temperature_k(features: Features) -> float | None:
-    """Temperature of camera or sensor, whichever is selected, in kelvins; None if it has no sensor."""
+    """Temperature of camera or sensor, whichever is selected, in kelvins, None without a thermometer."""
     celsius = features.read(float, "DeviceTemperature", "TemperatureAbs")
     return None if celsius is None else round(celsius + ZERO_CELSIUS_K, 2)
 
@@ -109,7 +109,7 @@ def _set_binning(features: Features, binning: int) -> None:
 
 
 def _set_axis(features: Features, settings: StandardSettings, axis: str, start: int, extent: int) -> int:
-    """Set size and start of the region along an axis; returns its number of pixels in a frame."""
+    """Set size and start of the region along an axis. Returns its number of pixels in a frame."""
     binning, size, offset = settings.binning, {"Y": "Height", "X": "Width"}[axis], f"Offset{axis}"
     n_pixels = extent // binning
     if settings.region is None:
@@ -133,7 +133,7 @@ def _set_pixel_format(features: Features, settings: StandardSettings) -> str:
 
 
 def series_trigger(features: Features) -> str:
-    """The trigger of a camera that starts a series; empty if it has none."""
+    """The trigger of a camera that starts a series, empty if it has none."""
     offered = features.options("TriggerSelector")
     return next((trigger for trigger in SERIES if trigger in offered), "")
 
@@ -149,7 +149,7 @@ def _check_line_trigger(features: Features, settings: StandardSettings) -> None:
 
 
 def set_trigger(features: Features, settings: StandardSettings, trigger: Trigger, n_frames: int) -> None:
-    """Choose what starts the exposures of a series."""
+    """Choose the trigger of the exposures of a series."""
     features.choose_if_offered("AcquisitionMode", "Continuous")
     _limit_frame_rate(features, is_on=False)
     features.choose_if_offered("TriggerMode", "Off")  # a camera with one trigger has no selector
@@ -168,13 +168,13 @@ def set_trigger(features: Features, settings: StandardSettings, trigger: Trigger
 
 
 def _limit_frame_rate(features: Features, *, is_on: bool) -> None:
-    """Switch the frame rate on or off; while it is on, it limits the exposure time."""
+    """Switch the frame rate on or off. While it is on, it limits the exposure time."""
     for feature in ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled"):
         features.switch(feature, is_on=is_on)
 
 
 def _shorten_overlap(features: Features) -> None:
-    """Allow short pulses: Basler cameras take none that is shorter than the overlap with the read-out."""
+    """Allow short pulses, since Basler cameras need pulses longer than the overlap with the read-out."""
     if feature := features.find("ExposureOverlapTimeMax", "ExposureOverlapTimeMaxAbs"):
         features.set_float("overlap of exposures", feature, features.float_bounds(feature)[0])
 
@@ -189,7 +189,7 @@ def _choose_trigger(features: Features, settings: StandardSettings, selector: st
 
 
 def _set_number_of_frames(features: Features, n_frames: int) -> None:
-    """Set how many exposures the edge starts that starts a series."""
+    """Set how many exposures follow the edge that starts a series."""
     selector = series_trigger(features)
     if selector == "AcquisitionStart":
         features.choose_if_offered("AcquisitionMode", "MultiFrame")
@@ -199,7 +199,7 @@ def _set_number_of_frames(features: Features, n_frames: int) -> None:
 
 
 def set_exposure(features: Features, exposure_s: float) -> float:
-    """Set the exposure time; returns the one that the camera makes, in seconds."""
+    """Set the exposure time, and return the time that the camera makes, in seconds."""
     feature = features.find(*EXPOSURE_TIME)
     return 1e-6 * features.set_float("exposure", feature, 1e6 * exposure_s, _microseconds)
 
@@ -212,7 +212,7 @@ def read_exposure_s(features: Features) -> float | None:
 def frame_period_s(features: Features, settings: StandardSettings, series: Series, trigger: Trigger) -> float:
     """Time from one exposure to the next in a series that the camera times, in seconds.
 
-    The camera is set to it, unless it is triggered in another way: a simulated camera is.
+    The camera is set to it, unless it is triggered in another way, as a simulated camera is.
     """
     setting, wanted_hz = "frame_rate", settings.frame_rate
     if series.trigger == "external_start":

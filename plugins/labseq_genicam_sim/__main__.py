@@ -1,4 +1,4 @@
-"""The process of a simulated camera: Aravis' own, with pixels that its parent makes."""
+"""The process of Aravis' simulated camera, with pixels that its parent makes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ HALF: Final = 0.5
 CURRENT_ADDRESS: Final = 0x24
 STREAM_PORT: Final = 0xD00
 STREAM_ADDRESS: Final = 0xD18
-"""Bootstrap registers of GigE Vision: its own address, and the destination of frames."""
+"""Bootstrap registers of GigE Vision for its own address and the destination of frames."""
 
 START_TIMEOUT_S: Final = 20.0
 """How long it waits for the address at which each simulated camera starts. Each has it for some milliseconds,
@@ -47,8 +47,8 @@ class SimulatedCamera:
     """A GigE Vision camera on loopback, as long as this process lives.
 
     Args:
-        expose: Makes a frame's bytes, in its pixel format; None fails the frame. Called by the
-            camera's own thread, which answers nothing meanwhile.
+        expose: Makes a frame's bytes, in its pixel format. None fails the frame. Called by the camera's own
+            thread, which answers nothing meanwhile.
     """
 
     def __init__(self, setup: Setup, expose: Callable[[Exposure], bytes | None]) -> None:
@@ -86,7 +86,7 @@ class SimulatedCamera:
         self._library.arv_fake_camera_set_fill_pattern(self._registers, self._fill_pattern, None)
 
     def _fill(self, buffer: int, _data: Any, exposure_us: int, gain: int, pixel_format: int) -> None:
-        """Fill a frame; the library calls this when it begins the frame."""
+        """Fill a frame. The library calls this when it begins the frame."""
         n, self._n = self._n, self._n + 1
         names = ("OffsetX", "OffsetY", "Width", "Height", "BinningHorizontal", "BinningVertical")
         names += ("ReverseX", "ReverseY")
@@ -123,7 +123,7 @@ class SimulatedCamera:
 
 
 def _start_camera(setup: Setup) -> int:
-    """Start the camera; waits while another one is being started on this machine."""
+    """Start the camera. Waits while another one is being started on this machine."""
     lib = load_library()
     xml = description(ignores_triggers=setup.faults.ignores_triggers)
     file, name = tempfile.mkstemp(suffix=".xml")
@@ -139,7 +139,9 @@ def _start_camera(setup: Setup) -> int:
                 return camera
             lib.g_object_unref(camera)
             if time.monotonic() > end_s:
-                text = f"another program has port 3956 of {FIRST_ADDRESS}, as simulated cameras have; end it"
+                text = (
+                    f"another program has port 3956 of {FIRST_ADDRESS}, needed by simulated cameras; end it"
+                )
                 raise AravisError(text, "busy")
             time.sleep(0.01)
     finally:

@@ -1,4 +1,4 @@
-"""The simulated camera as the driver uses it: pictures of the simulation for a camera in another process."""
+"""The driver's connection to the simulated camera, which sends pictures to a camera in another process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from labseq_genicam_sim.fake import FakeCamera
 from labseq_genicam_sim.messages import Exposure, Faults
 
 PACKET_SIZE: Final = 15800
-"""Bytes of the packets if the settings name no size: large, since each packet takes the same time."""
+"""Bytes of the packets if the settings name no size, large since each packet takes the same time."""
 
 
 class SimulatedConnection(SimulatedExposures, AravisConnection):
@@ -48,11 +48,11 @@ class SimulatedConnection(SimulatedExposures, AravisConnection):
         self._fake.stop()
 
     def granted(self, n_bytes: int) -> int:
-        """All of it: the simulated camera sends no more than a socket has room for."""
+        """All of it, as the simulated camera sends no more than a socket has room for."""
         return n_bytes
 
     def expose(self, t_s: float | None, exposure_s: float | None) -> None:
-        """Begin an exposure; a camera that ignores triggers is only sent one."""
+        """Begin an exposure. A camera that ignores triggers is only sent one."""
         if self._ignores_triggers:
             self.fire()
         else:
@@ -61,8 +61,8 @@ class SimulatedConnection(SimulatedExposures, AravisConnection):
     def show(self, frame: Frame) -> None:
         """Trigger the camera, and wait until it has its picture.
 
-        That is there before the trigger is sent: the camera answers nothing while it waits for a picture, and
-        on a busy computer it would seem to be gone.
+        The picture is there before the trigger is sent, since the camera answers nothing while it waits for a
+        picture, and on a busy computer it would seem to be gone.
         """
         n, n_stops = self._fake.n_made, self._fake.n_stops
         self._pictures.append(frame)
@@ -72,19 +72,19 @@ class SimulatedConnection(SimulatedExposures, AravisConnection):
         self._fake.raise_pending()
 
     def wait(self, timeout_s: float) -> ExposureResult | None:
-        """Wait for a frame; raises what went wrong while its picture was made."""
+        """Wait for a frame. Raises an error that occurred while its picture was made."""
         taken = super().wait(timeout_s)
         self._fake.raise_pending()
         return taken
 
     def clear(self) -> None:
-        """Forget the series; a trigger in another thread waits no longer."""
+        """Forget the series. A trigger in another thread waits no longer."""
         self._fake.note_stop()
         self._pictures.clear()
         super().clear()
 
     def _picture(self, exposure: Exposure) -> NDArray[np.uint16]:
-        """What the sensor sees; black if no exposure was begun. Called by the camera's own thread."""
+        """The sensor's image, black if no exposure was begun. Called by the camera's own thread."""
         if self._series is not None:
             self._check(exposure)
         if not self._pictures:
@@ -92,7 +92,7 @@ class SimulatedConnection(SimulatedExposures, AravisConnection):
         return self._pictures.popleft().image
 
     def _check(self, exposure: Exposure) -> None:
-        """Raise if the camera is not set to what the simulation shows."""
+        """Raise if the camera's settings differ from the simulation's."""
         mode = self._settings.mode
         binning, (y, x) = mode.binning, (mode.region or (0, 0))[:2]
         height, width = mode.frame_shape(self._shape)
@@ -106,5 +106,5 @@ class SimulatedConnection(SimulatedExposures, AravisConnection):
             (exposure.reverse_y, exposure.reverse_x),
         )
         if came != wanted:
-            text = f"the camera reads (y, x, height, width, binning, reverse) = {came}; expected {wanted}"
+            text = f"the camera reads (y, x, height, width, binning, reverse) = {came}, not {wanted}"
             raise DeviceError(self._name, text)

@@ -1,6 +1,6 @@
 """The GenICam description of the simulated camera's registers, by which clients find its features.
 
-Addresses are those of Aravis' simulated camera and of the GigE Vision bootstrap registers.
+The addresses come from Aravis' simulated camera and the GigE Vision bootstrap registers.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ TRIGGERS: Final = {"Software": 1, "Line1": 2}
 """Trigger sources. Line1 is connected to nothing."""
 
 OF_EACH_TRIGGER: Final = frozenset({"TriggerMode", "TriggerSource", "TriggerActivation"})
-"""Features that each trigger has of its own; that of ``TriggerSelector`` is seen."""
+"""Features that each trigger has of its own. ``TriggerSelector`` chooses the visible one."""
 
 CATEGORIES: Final = {
     "DeviceControl": tuple(TEXTS),
@@ -79,7 +79,7 @@ CATEGORIES: Final = {
 
 
 def description(*, ignores_triggers: bool = False) -> str:
-    """The description, as XML; with ``ignores_triggers`` the software trigger has no effect."""
+    """The description, as XML. With ``ignores_triggers`` the software trigger has no effect."""
     places = dict(REGISTERS)
     if ignores_triggers:
         places["TriggerSoftware"] = places["Unconnected"]
@@ -189,7 +189,7 @@ def _command(name: str, register: str, value: int) -> str:
 def _float(
     name: str, register: str, formula: str, bounds: tuple[int, int], scale: float = 1.0
 ) -> Iterable[str]:
-    """A float that its register holds as an integer; the formula converts one to the other."""
+    """A float that its register holds as an integer. The formula converts between them."""
     to, back = formula.format("FROM", scale), formula.format("TO", 1 / scale)
     least, greatest = bounds
     yield f'<Float Name="{name}"><pValue>{name}Converter</pValue></Float>'

@@ -1,4 +1,4 @@
-"""The parent's side of a simulated camera: starts its process and makes its images."""
+"""The parent's side of a simulated camera, which starts its process and makes its images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from labseq_genicam_sim.messages import Channel, Exposure, Faults, Image, NotStarted, Ready, Setup
 
 START_TIMEOUT_S: Final = 30.0
-"""How long a camera may take to start; it takes half a second on an idle machine."""
+"""How long a camera may take to start. It takes half a second on an idle machine."""
 
 STOP_TIMEOUT_S: Final = 5.0
 """How long an exposure that is being made may take to end."""
@@ -36,7 +36,7 @@ class FakeCamera:
         sensor_shape: Height and width of the sensor, in pixels.
 
     Attributes:
-        address: IP address; empty before it has started.
+        address: IP address, empty before it has started.
     """
 
     def __init__(
@@ -95,14 +95,14 @@ class FakeCamera:
             raise
 
     def stop(self) -> None:
-        """End the process; legal at any time, and repeatedly."""
+        """End the process. Legal at any time, and repeatedly."""
         if self._process is None:
             return
         self.unplug()
         self._service.join(STOP_TIMEOUT_S)
         for pipe in (self._process.stdin, self._process.stdout, self._log):
             assert pipe is not None
-            with suppress(OSError):  # what was not sent goes nowhere
+            with suppress(OSError):  # unsent bytes go nowhere
                 pipe.close()
         self._process = None
 
@@ -120,30 +120,30 @@ class FakeCamera:
 
     @property
     def n_made(self) -> int:
-        """How many images were made: the number of the next exposure."""
+        """How many images were made, which is the number of the next exposure."""
         with self._changed:
             return self._n_made
 
     def wait_for_image(self, n: int, timeout_s: float, n_stops: int | None = None) -> bool:
-        """Wait until the image of exposure ``n`` was made, or the camera stopped; returns whether it was.
+        """Wait until the image of exposure ``n`` was made, or the camera stopped. True if it was made.
 
         Args:
             n: Number of the exposure.
             timeout_s: How long to wait.
-            n_stops: How often it had been stopped before the trigger; None: as often as now.
+            n_stops: How often it had been stopped before the trigger, None for as often as now.
         """
         n_stops = self.n_stops if n_stops is None else n_stops
         self._wait(lambda: n < self._n_made or n_stops < self.n_stops, timeout_s)
         return n < self.n_made
 
     def note_stop(self) -> None:
-        """It is stopped: an image that was not made by then is not made any more."""
+        """Note that it is stopped. An unfinished image is not made any more."""
         with self._changed:
             self.n_stops += 1
             self._changed.notify_all()
 
     def unplug(self) -> None:
-        """Kill the camera, whatever it is doing; :meth:`start` plugs it in again, at its address."""
+        """Kill the camera, whatever it is doing. :meth:`start` plugs it in again, at its address."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -205,7 +205,7 @@ class FakeCamera:
 
 
 def _pixels(image: NDArray[np.uint16], exposure: Exposure) -> NDArray[np.uint16] | NDArray[np.uint8]:
-    """An image in the camera's pixel format: uint16 or, for Mono8, uint8 (height, width), little-endian.
+    """An image in the camera's pixel format, uint16 or, for Mono8, uint8 (height, width), little-endian.
 
     Raises:
         ValueError: The image is not uint16 (height, width) of the region.

@@ -20,7 +20,7 @@ class Faults:
         packet_loss: Fraction of the packets of frames that are never sent, 0 to 1.
         failed_frames: Numbers of the frames, from 0, that come with half of their packets.
         late_by: Delay of each frame, in seconds. The camera answers nothing meanwhile.
-        unplugged_at: Number of the frame at which the camera vanishes, before it is sent; None for never.
+        unplugged_at: Number of the frame at which the camera vanishes, before it is sent, None for never.
         busy: Whether another application controls the camera.
         ignores_triggers: Whether its software trigger has no effect.
     """
@@ -40,7 +40,7 @@ class Setup:
     Attributes:
         serial: Serial number, at most 15 bytes.
         sensor_shape: Height and width of the sensor, in pixels.
-        address: Address that it had before; empty for any.
+        address: Address that it had before, empty for any.
         faults: Failures to simulate.
     """
 
@@ -52,10 +52,10 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """What the parent answers to an exposure.
+    """The parent's answer to an exposure.
 
     Attributes:
-        pixels: The bytes of a frame, in the camera's pixel format; None: the frame fails.
+        pixels: The bytes of a frame, in the camera's pixel format, None for a frame that fails.
     """
 
     pixels: bytes | None
@@ -99,7 +99,7 @@ class Exposure:
         binning_x: Columns that are added up.
         binning_y: Rows that are added up.
         reverse_x: 1 if the camera reverses the order of the columns.
-        reverse_y: 1 if it reverses that of the rows.
+        reverse_y: 1 if it reverses the order of the rows.
     """
 
     n: int
@@ -117,7 +117,7 @@ class Exposure:
 
 
 class Channel:
-    """Messages over a pipe in each direction; any thread may send, one receives."""
+    """Messages over a pipe in each direction. Any thread may send, one receives."""
 
     def __init__(self, reader: IO[bytes], writer: IO[bytes]) -> None:
         self._reader = reader
@@ -131,7 +131,7 @@ class Channel:
             self._writer.flush()
 
     def receive(self) -> Any:
-        """Wait for a message; None when the other side is gone."""
+        """Wait for a message. None when the other side is gone."""
         try:
             return pickle.load(self._reader)  # noqa: S301 - the other side is a process of ours
         except (OSError, EOFError, ValueError, pickle.UnpicklingError):  # closed, or cut off

@@ -7,7 +7,7 @@ sockets at another address as soon as it runs, and 127.0.0.1 is free again for t
 The library sends a whole frame at once. A :class:`Cable` forwards the packets as fast as it can, so that a
 receiver whose socket has only the default buffer (``net.core.rmem_default``, 208 KiB) loses packets, as with
 other cameras. Packets wait in the cable while there are more than a well configured socket holds, as with the
-pause frames of Ethernet: four frames, or what the kernel allows (``net.core.rmem_max``).
+pause frames of Ethernet. That is four frames, or the kernel's limit (``net.core.rmem_max``).
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def move(address: str) -> Cable | None:
     """Move the camera that was just started in this process to another address.
 
     Returns:
-        The cable that transmits its frames from now on. None if the camera stays: the system has no other
-        addresses on loopback, or another camera has this address.
+        The cable that transmits its frames from now on. None if the camera stays because the system has no
+        other addresses on loopback, or another camera has this address.
     """
     if sys.platform != "linux":
         return None
@@ -83,7 +83,7 @@ BREAK_S: Final = 2e-4
 """How long to wait before the next check, in seconds."""
 
 MAX_BREAKS: Final = 1000
-"""After this many checks packets are sent anyway: a packet socket receives them elsewhere."""
+"""After this many checks packets are sent anyway, because a packet socket receives them elsewhere."""
 
 SOCKETS: Final = Path("/proc/net/udp")
 """Linux's table of UDP sockets."""
@@ -91,15 +91,15 @@ SOCKETS: Final = Path("/proc/net/udp")
 LARGEST_PACKET: Final = 65536
 
 AIM: Final = b"\xff\xffto "
-"""Prefix of a message with the destination of the following packets and the room there; no packet has this
+"""Prefix of a message with the destination of the following packets and the room there. No packet has this
 status."""
 
 
 class Cable(threading.Thread):
-    """Forwards the packets of frames; on Linux only.
+    """Forwards the packets of frames, on Linux only.
 
     Args:
-        out: A UDP socket at the camera's address; this object owns it.
+        out: A UDP socket at the camera's address, which this object owns.
 
     Attributes:
         end: The socket that the camera sends to instead of the destination.
@@ -109,7 +109,7 @@ class Cable(threading.Thread):
     def __init__(self, out: socket.socket) -> None:
         super().__init__(name="cable", daemon=True)
         self.end, self._own = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.end.setblocking(False)  # as GLib expects; it waits by itself
+        self.end.setblocking(False)  # as GLib expects, which waits by itself
         out.setblocking(True)
         self._out = out
         self.address: str = out.getsockname()[0]
@@ -118,7 +118,7 @@ class Cable(threading.Thread):
         self._is_read = True
 
     def aim(self, host: str, port: int, payload: int) -> None:
-        """Set the destination of later frames, of ``payload`` bytes; packets in the cable keep theirs."""
+        """Set the destination of later frames, of ``payload`` bytes. Packets in the cable keep theirs."""
         if (host, port) != self._aimed_at:
             self._aimed_at = host, port
             room = granted(buffer_size(payload))
@@ -140,7 +140,7 @@ class Cable(threading.Thread):
             left -= len(packet) + OVERHEAD
 
     def _wait_for_room(self) -> int:
-        """Wait until half of the receiver's room is free; returns the bytes that can be sent."""
+        """Wait until half of the receiver's room is free, and return the bytes that can be sent."""
         for _ in range(MAX_BREAKS):
             waiting = n_waiting(self._destination[1])
             if waiting <= self._room // 2:
@@ -151,7 +151,7 @@ class Cable(threading.Thread):
 
 
 def n_waiting(port: int) -> int:
-    """Bytes that wait to be read at a UDP port of this machine; 0 if no process uses it."""
+    """Bytes that wait to be read at a UDP port of this machine, 0 if no process uses it."""
     for line in SOCKETS.read_text().splitlines()[1:]:
         _, local, _, _, queues, *_ = line.split()
         if local.endswith(f":{port:04X}"):
