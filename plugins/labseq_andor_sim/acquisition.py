@@ -60,7 +60,7 @@ class Acquisition(SimulatedExposures):
         self.empty_buffer(self._errors.buffer_frames or max(2, BUFFER_BYTES // (2 * height * width)))
 
     def StartAcquisition(self) -> None:
-        """Arm the sensor; with the internal trigger the first exposure begins."""
+        """Arm the sensor. With the internal trigger the first exposure begins."""
         timing, mode = self._times, self._times.sensor_mode
         require(timing.optics.reads_images, Code.INVALID_MODE)
         is_bulb = timing.trigger == EXTERNAL_EXPOSURE
@@ -72,12 +72,12 @@ class Acquisition(SimulatedExposures):
         self.start(series, mode, ExposureTiming(timing.readout_s, timing.kinetic_s, overlaps, self._arm_s))
 
     def AbortAcquisition(self) -> None:
-        """Stop; frames that were not read out are lost."""
+        """Stop. Frames that were not read out are lost."""
         require(self.is_acquiring, Code.IDLE)
         self.abort()
 
     def SendSoftwareTrigger(self) -> None:
-        """Expose; refused during an exposure, or a read-out that cannot overlap with the next exposure."""
+        """Expose. Refused during an exposure, or a read-out that cannot overlap with the next exposure."""
         require(self._times.trigger == SOFTWARE and self._times.runs_till_abort, Code.INVALID_MODE)
         require(self.is_acquiring, Code.IDLE)
         require(not self.is_busy, Code.ERROR_CODES)
@@ -110,12 +110,12 @@ class Acquisition(SimulatedExposures):
         return first, last
 
     def GetMetaDataInfo(self, _start: Any, since_start_ms: Any, index: int) -> None:
-        """Milliseconds from the start of the series to that of a frame counted from 0."""
+        """Milliseconds from the start of the series to the start of a frame, counted from 0."""
         require(index + 1 in self.buffer, Code.P2INVALID)
         since_start_ms.contents.value = (self.buffer[index + 1].t_start_s - self.started_s) * 1e3
 
     def WaitForAcquisitionByHandleTimeOut(self, _handle: int, timeout_ms: int) -> None:
-        """Wait in real time for a frame; on a virtual clock it is there already, or does not come."""
+        """Wait in real time for a frame. On a virtual clock it is there already, or does not come."""
         require(self.wait(timeout_ms / 1e3), Code.NO_NEW_DATA)
 
     def CancelWait(self) -> None:

@@ -1,4 +1,4 @@
-"""The simulated camera: its identity, and which calls it accepts when."""
+"""The simulated camera with its identity and its rules for calls."""
 
 # ruff: noqa: D102, N802 - the SDK's names, which its manual explains
 
@@ -27,7 +27,7 @@ NOT_WHILE_ACQUIRING: Final = ("Set", "Cooler", "Prepare", "Start", "GetTemperatu
 class SimulatedCamera:
     """A simulated EMCCD camera as the SDK's functions show it.
 
-    Its sensor is the simulation's. The camera exists from the beginning, also while no program has it open;
+    Its sensor is the simulation's. The camera exists from the beginning, also while no program has it open.
     Initialize sets everything except the cooler to its defaults.
 
     Args:
@@ -65,7 +65,7 @@ class SimulatedCamera:
         }
 
     def initialize(self) -> None:
-        """Get ready; refused if another program uses the camera."""
+        """Get ready. Refused if another program uses the camera."""
         if self.faults.held:
             raise Refused(Code.VXDNOTINSTALLED)
         if self.faults.unplugged:
@@ -92,7 +92,7 @@ class SimulatedCamera:
             raise Refused(Code.ACQUIRING)
 
     def trigger(self, t_s: float | None = None, width_s: float = 1e-3) -> bool:
-        """A pulse at the trigger input, now or at ``t_s`` of the clock; False if it started no exposure."""
+        """A pulse at the trigger input, now or at ``t_s`` of the clock. False if it started no exposure."""
         return self.acquisition.pulse(t_s, width_s)
 
     def GetHeadModel(self) -> str:
@@ -106,7 +106,7 @@ class SimulatedCamera:
         return 0, 0, 0, 0, *FIRMWARE
 
     def GetCapabilities(self) -> Capabilities:
-        """All that the driver asks for, but bulb with frame transfer: only the iXon 885 has it."""
+        """All that the driver asks for, except bulb with frame transfer, which only the iXon 885 has."""
         return Capabilities(
             ulAcqModes=sum(AcqModes),
             ulTriggerModes=sum(TriggerModes),

@@ -51,7 +51,7 @@ class SimulatedConnection(AndorConnection):
             world.wire("camera", self.camera.trigger)
 
     def warm(self, em_gain: float) -> None:
-        """Compute what all simulated frames have in common."""
+        """Compute the common part of all simulated frames."""
         region = self.settings.mode.region
         is_whole = region == (0, 0, *self.camera.optics.sensor_shape)
         mode = SensorMode(None if is_whole else region, self.settings.binning, em_gain)
@@ -78,14 +78,14 @@ def simulated_head(settings: AndorSettings, sensor_shape: tuple[int, int]) -> He
 
 
 class Computer:
-    """The cameras that are connected to a computer, and the one that is selected."""
+    """The cameras that are connected to a computer, and the selected one."""
 
     def __init__(self, cameras: Sequence[SimulatedCamera]) -> None:
         self.cameras = cameras
         self._handle = 0
 
     def camera(self, handle: int | None = None) -> SimulatedCamera:
-        """The camera with a handle; None: the one that is selected."""
+        """The camera with a handle, None for the selected one."""
         return pick(self.cameras, (handle or self._handle) - FIRST_HANDLE, Code.NOT_INITIALIZED)
 
     @property
@@ -135,7 +135,7 @@ class SimulatedLibrary:
         raise AttributeError(name)
 
     def _call(self, name: str, *arguments: Any) -> int:
-        """Call a function as C does: returns its code, and writes its results through the pointers."""
+        """Call a function as C does. Returns its code, and writes its results through the pointers."""
         inputs, outputs = SIGNATURES[name].split(" ")
         passed, places = arguments[: len(inputs)], arguments[len(inputs) :]
         try:

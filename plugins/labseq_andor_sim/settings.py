@@ -1,7 +1,7 @@
-"""What can be set at the simulated camera: cooler, amplifier, EM gain, region, shutter, exposure, trigger.
+"""Settings of the simulated camera (cooler, amplifier, EM gain, region, shutter, exposure, trigger).
 
-Methods that are named as functions of the SDK are these functions: they take what is passed, return what is
-written through pointers, and raise :class:`Refused` where the camera refuses the call.
+Methods with names of SDK functions are these functions. They take the arguments, return the results that C
+writes through pointers, and raise :class:`Refused` where the camera refuses the call.
 """
 
 # ruff: noqa: D102, N802 - the SDK's names, which its manual explains
@@ -40,7 +40,7 @@ MIN_GAIN, MAX_GAIN, MAX_ADVANCED_GAIN = 2, 300, 1000
 CLOSING_MS, OPENING_MS = 20, 27
 """Times that the shutter takes to close and to open (ours, as cameras of this kind)."""
 MIN_EXPOSURE_S, MAX_EXPOSURE_S = 10e-6, 1000.0
-"""Shortest exposure without frame transfer, and longest (ours); with it, the shortest is the read-out."""
+"""Shortest exposure without frame transfer, and longest (ours). With it, the shortest is the read-out."""
 ENDLESS: Final = 2**31
 
 ROOM_C: Final = 20.0
@@ -69,7 +69,7 @@ def require(is_valid: object, code: Code = Code.P1INVALID) -> None:
 
 
 def pick(values: Sequence[T], index: int, code: Code = Code.P1INVALID) -> T:
-    """One of some values; refuses an index that is out of range."""
+    """One of some values. Refuses an index that is out of range."""
     require(0 <= index < len(values), code)
     return values[index]
 
@@ -133,11 +133,11 @@ class Cooler:
             self._change(is_on=False)
 
     def SetCoolerMode(self, stays_on: int) -> None:
-        """1: the cooler stays on when the SDK is shut down."""
+        """Mode 1 keeps the cooler on when the SDK is shut down."""
         self._stays_on = bool(stays_on)
 
     def SetFanMode(self, mode: int) -> None:
-        """0: full, 1: low, 2: off."""
+        """Mode 0 is full, 1 low, 2 off."""
         require(0 <= mode <= 2)
 
     @property
@@ -157,7 +157,7 @@ class Amplifiers:
         is_em: Whether the amplifier behind the EM register is used.
         rate_hz: Pixels per second.
         shift_s: Time to shift the rows by one, in seconds.
-        em_gain: EM gain as it was set; 0 for none.
+        em_gain: EM gain as it was set, 0 for none.
     """
 
     def __init__(self, head: Head) -> None:
@@ -214,7 +214,7 @@ class Amplifiers:
         return pick(self._head.shifts_s, index) * 1e6
 
     def GetFastestRecommendedVSSpeed(self) -> tuple[int, float]:
-        """Its number, and the speed in microseconds."""
+        """Number of the speed, and the speed in microseconds."""
         return self._head.recommended_shift, self.GetVSSpeed(self._head.recommended_shift)
 
     def SetVSSpeed(self, index: int) -> None:
@@ -235,11 +235,11 @@ class Amplifiers:
         pick(self._head.preamp_gains, index)
 
     def SetBaselineClamp(self, state: int) -> None:
-        """Has no effect: the offset is stable."""
+        """Has no effect, since the offset is stable."""
         require(state in (0, 1))
 
     def SetEMGainMode(self, mode: int) -> None:
-        """0: steps of a converter, which are not modelled; 3: real gain."""
+        """Mode 0 is steps of a converter, which are not modelled, and 3 real gain."""
         require(mode in (0, REAL_GAIN_MODE))
         self._gain_mode, self.em_gain = mode, 0
 
@@ -253,7 +253,7 @@ class Amplifiers:
         return MIN_GAIN, MAX_ADVANCED_GAIN if self._is_advanced else MAX_GAIN
 
     def SetEMCCDGain(self, gain: int) -> None:
-        """Set the gain; 0: off, the only value outside of real gain."""
+        """Set the gain. 0 is off, the only value outside of real gain."""
         low, high = self.GetEMGainRange()
         require(gain == 0 or (self._gain_mode == REAL_GAIN_MODE and low <= gain <= high))
         self.em_gain = gain
@@ -283,7 +283,7 @@ class Optics:
         self._region, self._binning = (0, 0, *self.sensor_shape), 1
 
     def mode(self, em_gain: float) -> SensorMode:
-        """How the sensor is exposed at this moment."""
+        """Mode in which the sensor is exposed at this moment."""
         region = None if self._region == (0, 0, *self.sensor_shape) else self._region
         is_opened = self._clock.now() >= self._opened_s + OPENING_MS / 1e3 - 1e-9
         is_open = self.shutter == SHUTTER_AUTO or (self.shutter == SHUTTER_OPEN and is_opened)
@@ -295,17 +295,17 @@ class Optics:
         return self._region[2] // self._binning, self._region[3] // self._binning
 
     def GetDetector(self) -> tuple[int, int]:
-        """Width and height of the sensor; of the region in isolated crop."""
+        """Width and height of the sensor, or of the region in isolated crop."""
         height, width = self._region[2:] if self.is_cropped else self.sensor_shape
         return width, height
 
     def SetReadMode(self, mode: int) -> None:
-        """4: images. The other modes can be chosen, but not acquired."""
+        """Mode 4 is images. The other modes can be chosen, but not acquired."""
         require(mode in range(FULL_IMAGE + 1))
         self.reads_images = mode == FULL_IMAGE
 
     def SetImage(self, hbin: int, vbin: int, left: int, right: int, bottom: int, top: int) -> None:
-        """Set the region, ends included, counted from 1; equal binning along both axes."""
+        """Set the region, ends included, counted from 1, with equal binning along both axes."""
         height, width = self.sensor_shape
         require(hbin >= 1)
         require(vbin == hbin, Code.P2INVALID)
@@ -319,7 +319,7 @@ class Optics:
     def SetIsolatedCropModeEx(
         self, active: int, height: int, width: int, vbin: int, hbin: int, left: int, bottom: int
     ) -> None:
-        """Crop the sensor; only with frame transfer."""
+        """Crop the sensor, only with frame transfer."""
         if active:
             require(self.frame_transfer, Code.INVALID_MODE)
             self.SetImage(hbin, vbin, left, left + width - 1, bottom, bottom + height - 1)
@@ -342,7 +342,7 @@ class Optics:
 
 
 class Timing:
-    """Exposure, read-out and cycle times; acquisition mode and trigger.
+    """Exposure, read-out and cycle times, acquisition mode and trigger.
 
     Attributes:
         trigger: Mode of the trigger, such as INTERNAL.
@@ -361,12 +361,12 @@ class Timing:
 
     @property
     def sensor_mode(self) -> SensorMode:
-        """How the sensor is exposed and read."""
+        """Mode in which the sensor is exposed and read."""
         return self.optics.mode(float(max(1, self._amplifiers.em_gain)) if self._amplifiers.is_em else 1.0)
 
     @property
     def readout_s(self) -> float:
-        """From the end of an exposure to its frame, in seconds."""
+        """Time from the end of an exposure to its frame, in seconds."""
         amplifiers, is_cropped = self._amplifiers, self.optics.is_cropped
         rate_hz, shift_s, shape = amplifiers.rate_hz, amplifiers.shift_s, self.optics.sensor_shape
         return readout_s(rate_hz, shift_s, shape, self.sensor_mode, isolated_crop=is_cropped)
@@ -378,7 +378,7 @@ class Timing:
 
     @property
     def kinetic_s(self) -> float:
-        """From one exposure to the next with the internal trigger, in seconds."""
+        """Time from one exposure to the next with the internal trigger, in seconds."""
         shortest_s = self.exposure_s + (0.0 if self.optics.frame_transfer else self.readout_s)
         return max(shortest_s, self._cycle_s)
 
@@ -403,7 +403,7 @@ class Timing:
         self._exposure_s = seconds
 
     def SetKineticCycleTime(self, seconds: float) -> None:
-        """Set the time from one exposure to the next; shorter ones than possible have no effect."""
+        """Set the time from one exposure to the next. Shorter times than possible have no effect."""
         require(seconds >= 0)
         self._cycle_s = seconds
 
@@ -412,7 +412,7 @@ class Timing:
         return self.exposure_s, self.kinetic_s, self.kinetic_s
 
     def SetAcquisitionMode(self, mode: int) -> None:
-        """1: single, 2: accumulate, 3: kinetic, 5: run till abort."""
+        """Mode 1 is single, 2 accumulate, 3 kinetic, 5 run till abort."""
         require(mode in (1, 2, KINETIC, RUN_TILL_ABORT))
         self._mode = mode
 
@@ -429,13 +429,13 @@ class Timing:
         self.trigger = mode
 
     def SetTriggerInvert(self, mode: int) -> None:
-        """Has no effect: a simulated pulse has both edges."""
+        """Has no effect, since a simulated pulse has both edges."""
         require(mode in (0, 1))
 
     def SetFastExtTrigger(self, mode: int) -> None:
-        """Has no effect: the sensor has no cleaning cycle."""
+        """Has no effect, since the sensor has no cleaning cycle."""
         require(mode in (0, 1))
 
     def SetMetaData(self, state: int) -> None:
-        """Has no effect: there are always time stamps."""
+        """Has no effect, since there are always time stamps."""
         require(state in (0, 1))

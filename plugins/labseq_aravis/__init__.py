@@ -1,4 +1,4 @@
-"""A ctypes binding of the C library Aravis: GigE Vision and USB3 Vision cameras, with any Python.
+"""A ctypes binding of the C library Aravis for GigE Vision and USB3 Vision cameras, with any Python.
 
 The library is loaded when a camera is first searched or opened. The package imports nothing of labseq, so
 that the process of a simulated camera starts fast.

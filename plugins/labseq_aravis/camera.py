@@ -1,4 +1,4 @@
-"""Cameras: finding them, and one that is open."""
+"""Search for cameras, and access to an open one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NO_PACKET_SOCKET: Final = 1
 """Numbers of the library's policies for ranges and for streams."""
 
 KINDS: Final[dict[type, str]] = {bool: "boolean", int: "integer", float: "float", str: "string"}
-"""The library's names of kinds of features; bool first, since each is an int, too."""
+"""The library's names of kinds of features, bool first, since each bool is an int, too."""
 
 Value = TypeVar("Value", str, bool, int, float)
 Number = TypeVar("Number", int, float)
@@ -33,11 +33,11 @@ class FoundCamera:
 
     Attributes:
         id: Name by which the library opens it.
-        physical_id: Its name on the network or the bus: a MAC address, a USB GUID.
+        physical_id: Its name on the network or the bus, a MAC address or USB GUID.
         vendor: Manufacturer.
         model: Model.
         serial: Serial number.
-        address: IP address; empty for a camera on USB.
+        address: IP address, empty for a camera on USB.
         protocol: "GigEVision" or "USB3Vision".
     """
 
@@ -54,7 +54,7 @@ class FoundCamera:
 
 
 def find_cameras() -> tuple[FoundCamera, ...]:
-    """Search all networks and buses for cameras; takes about a second."""
+    """Search all networks and buses for cameras, which takes about a second."""
     lib = load_library()
     for index in range(lib.arv_get_n_interfaces()):
         name = lib.arv_get_interface_id(index)
@@ -137,7 +137,7 @@ class Camera:
         self._signal = (device, signal, callback)
 
     def close(self) -> None:
-        """Close its streams and release the camera; legal at any time, and repeatedly."""
+        """Close its streams and release the camera. Legal at any time, and repeatedly."""
         for stream in tuple(self._streams):
             stream.close()
         if self._signal is not None:
@@ -184,19 +184,19 @@ class Camera:
         return bool(self._call("arv_camera_is_feature_available", feature.encode()))
 
     def options(self, feature: str) -> tuple[str, ...]:
-        """Values of an enumeration that can be chosen; none if the camera does not have it."""
+        """Values of an enumeration that can be chosen, none if the camera does not have it."""
         if not self.is_available(feature):
             return ()
         name = "arv_camera_dup_available_enumerations_as_strings"
         return self._library.texts(name, self._open_handle(), feature.encode())
 
     def get(self, feature: str, kind: type[Value]) -> Value:
-        """Value of a feature: a text or an enumeration as str, a number as int or float."""
+        """Value of a feature, a text or an enumeration as str, a number as int or float."""
         value = self._call(f"arv_camera_get_{KINDS[kind]}", feature.encode())
         return kind(text(value) if kind is str else value)
 
     def set(self, feature: str, value: str | float) -> None:
-        """Set a feature of the kind that the value has: bool, int, float or str."""
+        """Set a feature of the value's kind, which is bool, int, float or str."""
         kind = next(name for kind, name in KINDS.items() if isinstance(value, kind))
         encoded = value.encode() if isinstance(value, str) else value
         self._call(f"arv_camera_set_{kind}", feature.encode(), encoded)
@@ -214,18 +214,18 @@ class Camera:
         return int(self._call("arv_camera_get_integer_increment", feature.encode()))
 
     def execute(self, feature: str) -> None:
-        """Execute a command; returns when the camera has confirmed it."""
+        """Execute a command, and return when the camera has confirmed it."""
         self._call("arv_camera_execute_command", feature.encode())
 
     # network packets, whose features have other names in this library
 
     @property
     def packet_size(self) -> int:
-        """Maximum size of a frame's packets, in bytes; GigE only."""
+        """Maximum size of a frame's packets, in bytes. GigE only."""
         return int(self._call("arv_camera_gv_get_packet_size"))
 
     def set_packet_size(self, n_bytes: int) -> None:
-        """Set the maximum size of packets, headers included; GigE only.
+        """Set the maximum size of packets, headers included. GigE only.
 
         Without this, the library determines the largest size that is transmitted when a stream is made.
         """
@@ -234,11 +234,11 @@ class Camera:
 
     @property
     def packet_delay_s(self) -> float:
-        """Pause between packets, in seconds; GigE only."""
+        """Pause between packets, in seconds. GigE only."""
         return int(self._call("arv_camera_gv_get_packet_delay")) * 1e-9
 
     def set_packet_delay_s(self, delay_s: float) -> None:
-        """Set the pause between packets, in seconds; GigE only."""
+        """Set the pause between packets, in seconds. GigE only."""
         self._call("arv_camera_gv_set_packet_delay", round(delay_s * 1e9))
 
     # acquisition
@@ -248,7 +248,7 @@ class Camera:
 
         Args:
             n_buffers: How many frames can wait until they are read.
-            options: How the stream handles losses; None for the defaults.
+            options: How the stream handles losses, None for the defaults.
         """
         if self.is_ethernet:
             self._library.arv_camera_gv_set_stream_options(self._open_handle(), NO_PACKET_SOCKET)
@@ -265,7 +265,7 @@ class Camera:
         return int(self._call("arv_camera_get_payload"))
 
     def start(self) -> None:
-        """Start the acquisition: frames come at the frame rate, or at each trigger."""
+        """Start the acquisition. Frames come at the frame rate, or at each trigger."""
         self._call("arv_camera_start_acquisition")
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""The C library libaravis, loaded on first use: its functions, their types and their errors."""
+"""The C library libaravis, loaded on first use, with the types and errors of its functions."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from collections.abc import Callable
 from typing import Any, Final
 
 INSTALL: Final = (
-    "install it: Debian and Ubuntu `apt-get install libaravis-0.8-0`, Fedora `dnf install aravis`, "
+    "install it (Debian and Ubuntu `apt-get install libaravis-0.8-0`, Fedora `dnf install aravis`, "
     "macOS `brew install aravis`, Windows the package mingw-w64-ucrt-x86_64-aravis of MSYS2 with its "
-    "folder `ucrt64\\bin` on PATH"
+    "folder `ucrt64\\bin` on PATH)"
 )
 """How to get libaravis on each system."""
 
@@ -21,8 +21,8 @@ class AravisError(Exception):
     """The library or a camera refused something.
 
     Attributes:
-        code: Kind of error: "timeout", "not found", "not controller", ... of :data:`ERRORS`, else the
-            library's domain and number; empty if it is not one of the library's.
+        code: Kind of error ("timeout", "not found", "not controller", ... of :data:`ERRORS`), else the
+            library's domain and number, empty if the error is not the library's.
     """
 
     def __init__(self, message: str, code: str = "") -> None:
@@ -31,7 +31,7 @@ class AravisError(Exception):
 
 
 class LibraryMissingError(AravisError):
-    """The library is not installed; the text says how to install it."""
+    """The library is not installed. The text says how to install it."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(f"the library libaravis 0.8 cannot be loaded ({reason}); {INSTALL}", "missing")
@@ -57,9 +57,9 @@ ERRORS: Final[dict[str, dict[int, str]]] = {
     },
     "arv_gc_error_quark": {4: "out of range", 7: "feature not found"},
 }
-"""Names of the errors that callers tell apart: by the function for their domain, and their code in it.
+"""Names of the errors that callers tell apart, by the function for their domain, and their code in it.
 
-The codes are those of the enumerations ``ArvDeviceError`` and ``ArvGcError``.
+The codes come from the enumerations ``ArvDeviceError`` and ``ArvGcError``.
 """
 
 TYPES: Final[dict[str, Any]] = {
@@ -169,7 +169,7 @@ SIGNATURES: Final[dict[str, str]] = {
     "arv_gv_fake_camera_is_running": "b p",
     "arv_gv_fake_camera_new_full": "p sss",
 }
-"""Types of the C functions that are called, by name: a letter of the result, then those of the arguments.
+"""Types of the C functions that are called, by name. A letter of the result, then letters of the arguments.
 
 They follow the headers of Aravis 0.8.26 and of GLib 2: ``v`` nothing, ``p`` any pointer, ``s`` text, ``b``
 gboolean, ``i`` gint or an enumeration, ``u`` guint, ``h`` guint16, ``l`` gint64, ``L`` guint64, ``d`` double,
@@ -189,7 +189,7 @@ NAMES: Final[dict[str, tuple[tuple[str, ...], ...]]] = {
         ("libglib-2.0-0.dll", "glib-2.0-0.dll"),
     ),
 }
-"""By system: file names of Aravis, GObject and GLib. Of each, the first that loads is used."""
+"""File names of Aravis, GObject and GLib by system. Of each, the first that loads is used."""
 
 
 class GError(ctypes.Structure):
@@ -211,7 +211,7 @@ INT, DOUBLE = 6 << 2, 15 << 2
 class Library:
     """The functions of Aravis, GObject and GLib in :data:`SIGNATURES`, as typed attributes.
 
-    ``library.arv_get_n_devices()`` calls one.
+    For example, ``library.arv_get_n_devices()`` calls a function.
     """
 
     def __init__(self) -> None:
@@ -240,7 +240,7 @@ class Library:
         return result
 
     def texts(self, name: str, *arguments: Any) -> tuple[str, ...]:
-        """Call a function that returns an array of texts and their number; the array is freed."""
+        """Call a function that returns an array of texts and their number, and free the array."""
         n = ctypes.c_uint()
         array = self.call(name, *arguments, ctypes.byref(n))
         if not array:
@@ -253,7 +253,7 @@ class Library:
             self.g_free(array)
 
     def set_property(self, instance: int, name: str, value: float) -> None:
-        """Set a property of an object that is a number or an enumeration; GObject converts the type."""
+        """Set a property of an object that is a number or an enumeration. GObject converts the type."""
         place = GValue()
         is_int = isinstance(value, int)
         self.g_value_init(ctypes.byref(place), INT if is_int else DOUBLE)
@@ -295,7 +295,7 @@ def library_version() -> str:
 
 
 def text(value: bytes | None) -> str:
-    """Text of a C string; empty for a null pointer."""
+    """Text of a C string, empty for a null pointer."""
     return "" if value is None else value.decode(errors="replace")
 
 

@@ -28,9 +28,9 @@ def buffer_size(payload: int) -> int:
 
 
 def granted(n_bytes: int) -> int:
-    """Bytes that a socket gets when it requests ``n_bytes``: under Linux at most ``net.core.rmem_max``.
+    """Bytes that a socket gets when it requests ``n_bytes``, under Linux at most ``net.core.rmem_max``.
 
-    A socket tells, since containers do not show that number. Limits of other systems are not known here.
+    A socket is asked, since containers do not show that number. Limits of other systems are not known here.
     """
     if sys.platform != "linux":
         return n_bytes
@@ -51,7 +51,7 @@ def set_buffer_size(port: int, n_bytes: int) -> None:
 
 
 def udp_sockets() -> Iterator[tuple[socket.socket, int, tuple[str, int]]]:
-    """The IPv4 UDP sockets of this process: a duplicate, the file descriptor, and address and port."""
+    """The IPv4 UDP sockets of this process, each as duplicate, file descriptor, and address with port."""
     descriptors = [int(path.name) for path in _OPEN_FILES.iterdir()] if _OPEN_FILES.is_dir() else []
     for descriptor in descriptors:
         with contextlib.suppress(OSError):  # another thread has closed it

@@ -1,4 +1,4 @@
-"""Frames of a camera: the stream that receives them, and their pixels."""
+"""The stream that receives a camera's frames, and their pixels."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def unpacked(
     n_line = width * dtype.itemsize
     stride = n_line + padding
     if height * stride > n_bytes:
-        text = f"a frame of {height} x {width} pixels has {n_bytes} bytes; expected {height * stride}"
+        text = f"a frame of {height} x {width} pixels has {n_bytes} bytes, not {height * stride}"
         raise AravisError(text, "size")
     raw = np.ctypeslib.as_array((ctypes.c_uint8 * (height * stride)).from_address(address))
     lines = raw.reshape(height, stride)[:, :n_line]
@@ -73,7 +73,7 @@ STATUS_NAMES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class StreamOptions:
-    """How a GigE stream receives; no effect for USB. None leaves the library's value.
+    """Options of a GigE stream, without effect for USB. None leaves the library's value.
 
     Attributes:
         packet_timeout_s: Time after which a missing packet is requested again.
@@ -91,10 +91,10 @@ class Buffer:
     """A received frame, or the reason why it failed.
 
     Attributes:
-        status: "success", or the reason why there is no image: one of :data:`STATUS_NAMES`, or "unknown".
-        frame_id: Number given by the camera; GigE cameras count 1 to 65535 and again from 1.
+        status: "success", or the reason why there is no image, one of :data:`STATUS_NAMES` or "unknown".
+        frame_id: Number given by the camera. GigE cameras count 1 to 65535 and again from 1.
         camera_time_ns: Start of its transfer or exposure on the camera's clock, in nanoseconds.
-        image: uint16 (height, width), a copy; None unless the status is "success".
+        image: uint16 (height, width), a copy, None unless the status is "success".
     """
 
     status: str
@@ -104,7 +104,7 @@ class Buffer:
 
 
 class Stream:
-    """Receives frames in the background; made by :meth:`Camera.create_stream`."""
+    """Receives frames in the background. Made by :meth:`Camera.create_stream`."""
 
     def __init__(self, library: Library, handle: int, is_ethernet: bool, streams: list[Stream]) -> None:
         self._library = library
@@ -137,7 +137,7 @@ class Stream:
             self._library.arv_stream_push_buffer(self._open_handle(), buffer)
 
     def close(self) -> None:
-        """Stop receiving and free the buffers; legal at any time, and repeatedly."""
+        """Stop receiving and free the buffers. Legal at any time, and repeatedly."""
         if self._handle is not None:
             self._library.g_object_unref(self._handle)
             self._handle = None
@@ -147,7 +147,7 @@ class Stream:
         """Wait for the next frame, complete or not.
 
         Returns:
-            The frame; None if none came in time.
+            The frame, None if none came in time.
         """
         handle = self._open_handle()
         buffer = self._library.arv_stream_timeout_pop_buffer(handle, max(0, round(timeout_s * 1e6)))
@@ -185,5 +185,5 @@ class Stream:
 
     def _open_handle(self) -> int:
         if self._handle is None:
-            raise AravisError("the stream is closed; make another one", "closed")
+            raise AravisError("the stream is closed; make another stream", "closed")
         return self._handle

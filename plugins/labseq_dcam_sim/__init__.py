@@ -1,4 +1,4 @@
-"""A simulator of Hamamatsu's DCAM-API for ``labseq_pylablib``: a qCMOS camera behind its C functions."""
+"""A simulator of Hamamatsu's DCAM-API for ``labseq_pylablib``, a qCMOS camera behind its C functions."""
 
 from labseq_dcam_sim.camera import Faults, SimulatedCamera
 from labseq_dcam_sim.connection import SimulatedConnection

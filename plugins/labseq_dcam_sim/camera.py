@@ -1,4 +1,4 @@
-"""The simulated camera: which calls it accepts in which state, its buffer, and its failures."""
+"""The simulated camera with its states, its buffer, and its failures."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TIME_CONSTANT_S: Final = 60.0
 
 @dataclass(slots=True)
 class Faults(CameraFaults):
-    """Failures to simulate; may be changed at any time.
+    """Failures to simulate. They may be changed at any time.
 
     Attributes:
         lost_frames: How many of the next frames do not reach the computer.
@@ -60,7 +60,7 @@ class Exposures(SimulatedExposures):
         super().empty_buffer(n_frames)
 
     def is_missed(self) -> bool:
-        """A missed trigger is not counted; a frame that is lost on its way is."""
+        """A missed trigger is not counted, but a frame that is lost on its way is."""
         if super().is_missed():
             return True
         stamp, self._n_exposed = self._n_exposed, self._n_exposed + 1
@@ -72,7 +72,7 @@ class Exposures(SimulatedExposures):
 
 
 class SimulatedCamera:
-    """A simulated ORCA-Quest as DCAM's functions show it; its sensor is the simulation's.
+    """A simulated ORCA-Quest as DCAM's functions show it, with the simulation's sensor.
 
     Args:
         world: The simulation.
@@ -109,7 +109,7 @@ class SimulatedCamera:
         self.is_open = False
 
     def trigger(self, t_s: float | None = None, width_s: float = 1e-3) -> bool:
-        """A pulse at the trigger input, now or at ``t_s`` of the clock; False if it started no exposure."""
+        """A pulse at the trigger input, now or at ``t_s`` of the clock. False if it started no exposure."""
         return self.exposures.pulse(t_s, width_s)
 
     def check(self) -> None:
@@ -118,7 +118,7 @@ class SimulatedCamera:
         require(not self.faults.unplugged, Code.NOCONNECTION)
 
     def open(self) -> None:
-        """Get ready; refused if another program uses the camera."""
+        """Get ready. Refused if another program uses the camera."""
         require(not (self.faults.held or self.is_open), Code.EXCLUDED)
         require(not self.faults.unplugged, Code.NOCONNECTION)
         self.is_open = True
@@ -158,7 +158,7 @@ class SimulatedCamera:
         return self.properties.get(number)
 
     def set_value(self, number: int, value: float) -> float:
-        """Set a property; returns the value that it has then."""
+        """Set a property, and return its new value."""
         if number in (Property.SENSOR_COOLER, Property.SENSOR_TEMPERATURE_TARGET):
             self._from_c, self._cooled_since_s = self.temperature_c, self._clock.now()
         self.properties.set(number, value, self.status)
@@ -176,7 +176,7 @@ class SimulatedCamera:
     # buffer and series
 
     def allocate(self, n_frames: int) -> None:
-        """Allocate the buffer; only without one."""
+        """Allocate the buffer, only without one."""
         require(self.status == Status.STABLE, Code.NOTSTABLE)
         require(n_frames >= 1, Code.INVALIDPARAM)
         height, width = self.properties.mode.frame_shape(self.properties.sensor_shape)
@@ -184,12 +184,12 @@ class SimulatedCamera:
         self.exposures.empty_buffer(n_frames)
 
     def release(self) -> None:
-        """Free the buffer; not in a series."""
+        """Free the buffer, but not in a series."""
         require(self.status != Status.BUSY, Code.BUSY)
         self._buffer = None
 
     def start(self, mode: int) -> None:
-        """Start a series; only with a buffer. SNAP ends when the buffer is full."""
+        """Start a series, only with a buffer. SNAP ends when the buffer is full."""
         require(self.status != Status.BUSY, Code.BUSY)
         require(mode in (SEQUENCE, SNAP), Code.INVALIDPARAM)
         if self._buffer is None:
@@ -207,12 +207,12 @@ class SimulatedCamera:
         self.exposures.start(series, properties.mode, timing)
 
     def stop(self) -> None:
-        """End the series; without one, no effect."""
+        """End the series. No effect without one."""
         if self.exposures.is_acquiring:
             self.exposures.abort()
 
     def fire(self) -> None:
-        """A software trigger; only in a series that waits for one, and not before the last frame is read."""
+        """A software trigger, only in a series that waits for it, and not before the last frame is read."""
         require(self.exposures.is_acquiring, Code.NOTBUSY)
         require(self.properties.get(Property.TRIGGER_SOURCE) == 3, Code.NOTSUPPORT)
         require(not self.exposures.is_busy, Code.TOOFREQUENTTRIGGER)
@@ -238,13 +238,13 @@ class SimulatedCamera:
         )
 
     def wait(self, timeout_ms: int) -> None:
-        """Wait for a frame; refused once after ``abort_wait``."""
+        """Wait for a frame. Refused once after ``abort_wait``."""
         if self._is_aborted:
             self._is_aborted = False
             raise Refused(Code.ABORT)
         require(self.exposures.wait(timeout_ms / 1e3), Code.ABORT if self._is_aborted else Code.TIMEOUT)
 
     def abort_wait(self) -> None:
-        """Make the wait that goes on return, or the next one."""
+        """Make the present wait return, or the next one."""
         self._is_aborted = True
         self.exposures.cancel_wait()

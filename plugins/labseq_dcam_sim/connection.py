@@ -20,8 +20,8 @@ from labseq_dcam_sim.properties import ROW_PAIR_S, STEP_PX
 class SimulatedConnection(Dcam):
     """pylablib on a simulated library with one camera, whose sensor is the simulation's.
 
-    It takes the place of any interface in a dry run; the steps of the region are those of DCAM cameras only
-    where the settings name ``dcam``.
+    It takes the place of any interface in a dry run. The steps of the region are a DCAM camera's only where
+    the settings name ``dcam``.
 
     Attributes:
         simulated: The camera.
@@ -43,7 +43,7 @@ class SimulatedConnection(Dcam):
 
     @property
     def sensor_shape(self) -> tuple[int, int] | None:
-        """That of the simulation."""
+        """The shape of the simulation's sensor."""
         return self._shape
 
     @property
@@ -53,7 +53,7 @@ class SimulatedConnection(Dcam):
         return -(-height // 2) * ROW_PAIR_S[0 if self.settings.readout_mode == "slow" else 1]
 
     def warm(self) -> None:
-        """Import pylablib, and compute what all simulated frames have in common."""
+        """Import pylablib, and compute the common part of all simulated frames."""
         super().warm()
         self._world.prepare_sensor(self.settings.mode)
 

@@ -104,7 +104,7 @@ SIGNATURES: Final[Mapping[str, tuple[Any, ...]]] = {
     "dcamwait_start": (HANDLE, DCAMWAIT_START),
     "dcamwait_abort": (HANDLE,),
 }
-"""Function -> types of its arguments; a structure stands for a pointer to it."""
+"""Function -> types of its arguments. A structure means a pointer to it."""
 
 
 class Code(IntEnum):

@@ -1,4 +1,4 @@
-"""The simulated library: DCAM's functions as C functions, called with the structures of its header."""
+"""The simulated library with DCAM's functions as C functions, called with the structures of its header."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FIRST_WAIT: Final = 0x2000
 
 
 class SimulatedLibrary:
-    """The C functions of DCAM-API with some cameras; each attribute is one, as of a loaded library.
+    """The C functions of DCAM-API with some cameras, as attributes like a loaded library's.
 
     Args:
         cameras: The cameras of the computer.
@@ -181,7 +181,7 @@ class SimulatedLibrary:
 
 
 def _passed(kind: Any) -> Any:
-    """The type of an argument: a pointer for a structure."""
+    """The type of an argument, a pointer for a structure."""
     is_structure = isinstance(kind, type) and issubclass(kind, ctypes.Structure)
     return ctypes.POINTER(kind) if is_structure else kind
 

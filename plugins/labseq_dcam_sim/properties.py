@@ -1,4 +1,4 @@
-"""The properties of the simulated camera: values, limits, and when they may be set."""
+"""The properties of the simulated camera, with values, limits, and when they may be set."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ ROW_PAIR_S: Final = (172.8e-6, 7.2e-6)
 """Time to read two rows, in the ultra-quiet (1) and the standard scan (2), in seconds.
 
 Measured at two ORCA-Quest as the jitter of their exposures (SCExAO's documentation of VAMPIRES, "Camera
-Triggering"); times 1152 it gives the published 5 and 120 frames per second.
+Triggering"). Times 1152 it gives the published 5 and 120 frames per second.
 """
 STEP_PX: Final = 4
 """Step and least size of the region (documentation of catkit2 for the ORCA-Quest)."""
 LONGEST_S: Final = 1800.0
 COLDEST_C, WARMEST_C = -35, 20
-"""Temperatures that can be set (ours; the sensor of a water-cooled camera is at -35 degC)."""
+"""Temperatures that can be set (ours, as the sensor of a water-cooled camera is at -35 degC)."""
 ELECTRONS_PER_COUNT, OFFSET_COUNTS = 0.11, 200.0
-"""Conversion factor: the defaults of the virtual lab's qCMOS sensor (measured: 0.103 to 0.105, SCExAO)."""
+"""Conversion factor and offset of the virtual lab's qCMOS sensor (SCExAO measured 0.103 to 0.105)."""
 
 IN_READY: Final = ACCESS_READY
 ALWAYS: Final = ACCESS_READY | ACCESS_BUSY
@@ -61,13 +61,13 @@ def require(is_valid: object, code: Code) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a property is, and the values that it takes.
+    """Kind of a property, and the values that it takes.
 
     Attributes:
         kind: MODE, LONG or REAL.
-        low, high, step: Range; a step of 0 is none.
+        low, high, step: Range. A step of 0 is none.
         default: Value after the camera was opened.
-        access: In which states beside STABLE it may be set; None: it is read only.
+        access: In which states other than STABLE it may be set, None for read only.
         texts: Value of a mode -> its text.
     """
 
@@ -112,7 +112,7 @@ def _read_only(kind: int, high: float) -> Limits:
 
 
 class Properties:
-    """Values of the properties; those that follow from others are worked out when they are read.
+    """Values of the properties. Values that follow from others are worked out when they are read.
 
     Args:
         sensor_shape: (height, width) of the sensor.
@@ -189,7 +189,7 @@ class Properties:
         return Property(number)
 
     def next_to(self, number: int) -> Property:
-        """The property that follows a number; 0 for the first."""
+        """The property that follows a number, 0 for the first."""
         following = [prop for prop in sorted(self.limits) if prop > number]
         require(following, Code.NOPROPERTY)
         return following[0]
@@ -218,12 +218,12 @@ class Properties:
 
     @property
     def period_s(self) -> float:
-        """From one exposure to the next where the camera times them, in seconds; read-out overlaps."""
+        """Time from one exposure to the next where the camera times them, in seconds. Read-out overlaps."""
         shortest_s = max(self._values[P.EXPOSURE_TIME], self.readout_s)
         return max(shortest_s, self._values[P.INTERNAL_FRAME_INTERVAL])
 
     def _fits(self) -> bool:
-        """Whether the region is on the sensor; without SUBARRAY MODE it is not looked at."""
+        """Whether the region is on the sensor. It is not checked without SUBARRAY MODE."""
         values, (height, width) = self._values, self.sensor_shape
         is_on = values[P.SUBARRAY_MODE] == 2
         fits_h = values[P.SUBARRAY_HPOS] + values[P.SUBARRAY_HSIZE] <= width

@@ -16,7 +16,7 @@ from labseq.plugin.camera import CameraDriver, ExposureResult, OrientationSettin
 from labseq_frames.files import BadFramesError, Picture, Source, find_source, format_shape
 
 MAX_EXPOSURE_S: Final = 3600.0
-"""Longest exposure, in seconds; frames from files do not depend on it."""
+"""Longest exposure, in seconds. Frames from files do not depend on it."""
 
 
 class FramesSettings(OrientationSettings):
@@ -25,15 +25,15 @@ class FramesSettings(OrientationSettings):
     path: FilePath = Field(
         description="files to play, relative to this file: the folder of a run, a TIFF stack, a .npy file, "
         "an array of a .npz or HDF5 file (`file.h5:Andor/Pictures`), a folder of PNG, TIFF or .npy files, or "
-        "a pattern such as `frames/*.png`; files in the natural order of their names"
+        "a pattern such as `frames/*.png`. Files come in the natural order of their names"
     )
     images: Literal["all", "first"] = Field(
         default="all",
-        description="of a run: all frames of all shots in order, or only the first image of each shot",
+        description="of a run, all frames of all shots in order, or only the first image of each shot",
     )
     at_end: Literal["stop", "repeat"] = Field(
         default="stop",
-        description="after the last frame: end the run with an error that gives their number, or "
+        description="after the last frame, end the run with an error that gives their number, or "
         "begin again with the first",
     )
     readout: Duration = Field(
@@ -41,7 +41,7 @@ class FramesSettings(OrientationSettings):
     )
     time_stamps: Literal["session", "recorded"] = Field(
         default="session",
-        description="start of the exposure of a frame: on the clock of this session, or as recorded, on the "
+        description="start of the exposure of a frame on the clock of this session, or as recorded, on the "
         "clock of the earlier session, if the file contains it",
     )
 
@@ -49,7 +49,7 @@ class FramesSettings(OrientationSettings):
 class FramesCamera(CameraDriver):
     """Frames from files, with the timing and error behaviour of a real camera.
 
-    Each trigger takes the next frame, whatever the exposure; with the internal trigger each reading does. A
+    Each trigger takes the next frame, whatever the exposure. With the internal trigger each reading does. A
     frame can be read when exposure and read-out have passed on the clock. It has the exposure that it was
     recorded with if the file contains it, else the requested one.
     """
@@ -72,7 +72,7 @@ class FramesCamera(CameraDriver):
     def facts(self) -> CameraFacts:
         """Read-out time, longest exposure, and the shape of the first frame if there is one.
 
-        The first use before :meth:`open` reads the files; :meth:`open` reports what is wrong with them.
+        The first use before :meth:`open` reads the files. :meth:`open` reports their problems.
         """
         if not self._has_looked:
             with suppress(BadFramesError):
@@ -96,7 +96,7 @@ class FramesCamera(CameraDriver):
 
     @property
     def _image_shape(self) -> tuple[int, int] | None:
-        """(height, width) of the images; None if no frame was found."""
+        """(height, width) of the images, None if no frame was found."""
         return None if self._shape is None else self._orientation.shape((self._shape[0], self._shape[1]))
 
     def _connect(self) -> None:
@@ -122,7 +122,7 @@ class FramesCamera(CameraDriver):
         return source
 
     def _disconnect(self) -> None:
-        """Close the files; after the next :meth:`open` the first frame comes again."""
+        """Close the files. After the next :meth:`open` the first frame comes again."""
         if self._pictures is not None:
             self._pictures.close()
         self._pictures = self._damage = self._source = None
@@ -143,7 +143,7 @@ class FramesCamera(CameraDriver):
         return None if missing_s > timeout_s else self._coming.popleft()[1]
 
     def _stop(self) -> None:
-        """Drop frames that were not read; they are not played again."""
+        """Drop unread frames, which are not played again."""
         self._coming.clear()
         self._playing = None
 
@@ -178,7 +178,7 @@ class FramesCamera(CameraDriver):
         return picture
 
     def _read(self) -> Picture | None:
-        """Read the next frame; None after the last."""
+        """Read the next frame, None after the last."""
         assert self._source is not None
         picture = None if self._pictures is None else next(self._pictures, None)
         if picture is None and (self._pictures is None or self._settings.at_end == "repeat"):
@@ -187,5 +187,5 @@ class FramesCamera(CameraDriver):
         if picture is not None and picture.image.shape != self._shape:
             came, first = format_shape(picture.image.shape), format_shape(self._shape or ())
             text = f"the frame has {came} pixels, the first one {first}"
-            raise BadFramesError(picture.place, text, hint="play them one size at a time")
+            raise BadFramesError(picture.place, text, hint="play frames of one size at a time")
         return picture

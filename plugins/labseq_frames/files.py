@@ -1,4 +1,4 @@
-"""Frames in files: runs of labseq, TIFF stacks, PNG files, arrays of numpy and HDF5."""
+"""Frames in files, which are runs of labseq, TIFF stacks, PNG files, arrays of numpy and HDF5."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ _LOG.addHandler(logging.NullHandler())  # we report what it logs about damaged f
 
 
 class BadFramesError(Exception):
-    """Files that cannot be played; the camera turns it into an error of labseq.
+    """Files that cannot be played. The camera turns it into an error of labseq.
 
     Attributes:
-        problem: The file or folder, what is wrong with it, and perhaps what was expected and what to do.
+        problem: The file or folder with its fault, and perhaps what was expected and what to do.
     """
 
     def __init__(self, path: Path | str, what: str, expected: str = "", hint: str = "") -> None:
@@ -64,8 +64,8 @@ class Picture:
     Attributes:
         image: uint16 (height, width), in camera counts (ADU), pixel (y, x).
         place: File and place in it, for messages.
-        exposure_s: Exposure time, in seconds; None if the file does not contain it.
-        t_start_s: Start of the exposure on the clock of its own session, in seconds; None likewise.
+        exposure_s: Exposure time, in seconds, None if the file does not contain it.
+        t_start_s: Start of the exposure on the clock of its own session, in seconds, or None.
     """
 
     image: NDArray[np.uint16]
@@ -79,9 +79,9 @@ class Source:
     """Files that were found and checked.
 
     Attributes:
-        pictures: Starts to read all frames in order, one at a time; closing the generator closes its file.
+        pictures: Starts to read all frames in order, one at a time. Closing the generator closes its file.
             Raises BadFramesError if a file is damaged or contains something else.
-        about: Kind and number of files: JSON-ready values.
+        about: Kind and number of files, as JSON-ready values.
     """
 
     pictures: Callable[[], Generator[Picture]]
@@ -121,12 +121,12 @@ def _find(address: Path, images: Literal["all", "first"]) -> Source:
         return _of_kind(path, _matching(path), name)
     names = [sibling.name for sibling in path.parent.iterdir()] if path.parent.is_dir() else []
     similar = difflib.get_close_matches(path.name, names, n=1)
-    hint = f"did you mean '{similar[0]}'?" if similar else "check `path`; it is relative to the profile"
+    hint = f"did you mean '{similar[0]}'?" if similar else "check `path`, which is relative to the profile"
     raise BadFramesError(path, "no such file or folder", EXPECTED, hint)
 
 
 def _in_folder(folder: Path, images: Literal["all", "first"]) -> Source:
-    """A run, or the pictures in a folder; the folder of a run may contain pictures, too."""
+    """A run, or the pictures in a folder. The folder of a run may contain pictures, too."""
     files = [file for file in folder.iterdir() if file.suffix.lower() in IN_FOLDERS]
     files = [file for file in files if file.is_file() and not file.name.startswith(".")]
     if files and not (folder / "run.json").is_file():
@@ -141,7 +141,7 @@ def _in_folder(folder: Path, images: Literal["all", "first"]) -> Source:
 
 
 def _matching(path: Path) -> list[Path]:
-    """The files that match a pattern; brackets in the names of existing folders are not a pattern."""
+    """The files that match a pattern. Brackets in the names of existing folders are not a pattern."""
     root, pattern = path.parent, path.name
     while not root.is_dir():
         root, pattern = root.parent, f"{root.name}/{pattern}"
@@ -157,7 +157,7 @@ def _matching(path: Path) -> list[Path]:
 
 
 def _of_kind(path: Path, files: Sequence[Path], name: str = "") -> Source:
-    """The frames of files of one kind; of arrays with a name, those of this name."""
+    """The frames of files of one kind. ``name`` selects an array."""
     files = sorted(files, key=natural)
     kinds = {file: _KINDS.get(file.suffix.lower()) for file in files}
     if other := next((file for file, kind in kinds.items() if kind is None), None):
@@ -211,12 +211,12 @@ def format_shape(shape: tuple[int, ...]) -> str:
 
 def _check_shape(file: Path, shape: tuple[int, ...], first: Path, expected: tuple[int, ...]) -> None:
     if shape != expected:
-        text = f"its frames have {format_shape(shape)} pixels, those of {first.name} {format_shape(expected)}"
-        raise BadFramesError(file, text, "frames of one size", "play them one size at a time")
+        text = f"its frames have {format_shape(shape)} pixels, but {first.name} has {format_shape(expected)}"
+        raise BadFramesError(file, text, "frames of one size", "play frames of one size at a time")
 
 
 def _counts(pixels: NDArray[Any], place: str) -> NDArray[np.uint16]:
-    """The counts of a frame of integers; nothing is scaled or cut off.
+    """The counts of a frame of integers, without scaling or clipping.
 
     Raises:
         BadFramesError: They do not fit into 16 bits.
@@ -245,16 +245,16 @@ def run_source(run: Run, images: Literal["all", "first"]) -> Source:
     if run.status == "running":
         raise BadFramesError(run.path, "the run is still being written", hint="wait until it has ended")
     if not run.shots:
-        raise BadFramesError(run.path, "the run holds no complete shot", "one with frames")
+        raise BadFramesError(run.path, "the run holds no complete shot", "a run with frames")
     if run.record.get("record_frames") == "none":
-        text = "one that was made with `record_frames: all`"
+        text = "a run that was made with `record_frames: all`"
         raise BadFramesError(run.path, "the run holds no frames", text)
     about = {"source": "run", "run_id": str(run.record.get("run_id", "")), "n_shots": len(run.shots)}
     return Source(lambda: _run_pictures(run, first_only=images == "first"), about)
 
 
 def _run_pictures(run: Run, *, first_only: bool) -> Generator[Picture]:
-    """Shot by shot; failed attempts are left out."""
+    """The frames shot by shot, without failed attempts."""
     for shot in run.shots:
         try:
             images = shot.record().images
@@ -265,7 +265,7 @@ def _run_pictures(run: Run, *, first_only: bool) -> Generator[Picture]:
             if frame is not None:
                 yield Picture(frame.image, f"{shot.file}, image {i}", frame.exposure_s, frame.t_start_s)
             elif first_only:
-                hint = "record with `record_frames: all`, or set `images: all` to play what was kept"
+                hint = "record with `record_frames: all`, or set `images: all` to play the other frames"
                 raise BadFramesError(shot.file, "the first image of the shot was not kept", hint=hint)
 
 
@@ -308,7 +308,7 @@ def _png_shape(pillow: Any, file: Path) -> tuple[int, int]:
 
 @contextmanager
 def _opened_png(pillow: Any, file: Path) -> Generator[Any]:
-    """Only the header is read until the pixels are asked for."""
+    """An open picture. Only the header is read until the pixels are asked for."""
     try:
         with pillow.open(file, formats=["PNG"]) as opened:
             yield opened
@@ -326,11 +326,11 @@ def tiff_source(files: Sequence[Path]) -> Source:
     """One frame from each page of each TIFF file, integers, read with tifffile one page at a time.
 
     Args:
-        files: In order; at least one.
+        files: In order, at least one.
 
     Raises:
-        BadFramesError: tifffile is missing; a file is not a TIFF, is cut off, or its first page does not
-            hold integers, is not gray, or of another size.
+        BadFramesError: tifffile is missing, a file is not a TIFF, is cut off, or its first page does not hold
+            integers, is not gray, or of another size.
     """
     tifffile = load("tifffile", "tifffile", files[0])
     n_pages = 0
@@ -376,7 +376,7 @@ def _tiff_shape(file: Path, number: int, page: Any) -> tuple[int, int]:
 
 
 def _count_pages(file: Path, stack: Any) -> int:
-    """Number of pages; refuses a file in which some are missing, which tifffile only logs."""
+    """Number of pages. Refuses a file in which some are missing, which tifffile only logs."""
     messages: list[str] = []
     handler = logging.Handler(logging.ERROR)
     handler.emit = lambda record: messages.append(record.getMessage())
@@ -399,13 +399,13 @@ def _count_pages(file: Path, stack: Any) -> int:
 
 
 def array_source(files: Sequence[Path], name: str = "") -> Source:
-    """Frames in arrays: (n, height, width), or (height, width) for one.
+    """Frames in arrays of shape (n, height, width), or (height, width) for one.
 
     A frame at a time is read, except of .npz files, which cannot be read in parts.
 
     Args:
-        files: In order; at least one.
-        name: Which array of a .npz or HDF5 file; "" for the only one.
+        files: In order, at least one.
+        name: Which array of a .npz or HDF5 file, "" for the only one.
 
     Raises:
         BadFramesError: A file cannot be read, or its array holds no integers, or frames of another size.

@@ -32,7 +32,7 @@ class Camera:
         self._is_running, self._n_frames, self._due_s = True, 0, list[float]()
 
     def stop(self) -> None:
-        """End the acquisition. Unread frames are dropped."""
+        """End the acquisition; frames that were not read are dropped."""
         self._is_running, self._n_frames, self._due_s = False, 0, list[float]()
 
     def fire(self) -> None:
