@@ -34,7 +34,7 @@ OCCUPIED: Final = frozenset({"not controller", "access denied", "busy"})
 """Codes of errors which mean that another program controls the camera."""
 
 HINTS: Final = {
-    "missing": "to try things without it, use another camera, for example `use: virtual`",
+    "missing": "To try things without it, use another camera, for example `use: virtual`",
     "not found": "check its cable, power and network address. To try things without a camera, set "
     "`camera: simulated`",
 }
@@ -92,7 +92,7 @@ def translated_errors(name: str, what: str) -> Generator[None]:
     try:
         yield
     except LibraryMissingError as error:
-        raise DeviceError(name, f"{error}; {HINTS['missing']}") from error
+        raise DeviceError(name, f"{error}. {HINTS['missing']}") from error
     except AravisError as error:
         text = f"cannot {what}: {error}"
         if error.code in OCCUPIED:

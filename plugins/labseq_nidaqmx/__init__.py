@@ -7,7 +7,7 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the lines ``nidaqmx``; in a dry run the cards are simulated."""
+    """Offer the lines ``nidaqmx``, with simulated cards in a dry run."""
     registry.lines(
         "nidaqmx",
         "labseq_nidaqmx.lines:NidaqmxLines",

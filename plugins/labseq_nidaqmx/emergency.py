@@ -16,7 +16,7 @@ from functools import cache
 from typing import Any, TypeAlias
 
 Output: TypeAlias = tuple[str, str, float, float]
-"""Kind, "do" or "ao"; channel of the task; its value while the lines are off; while they are on."""
+"""Kind ("do" or "ao"), channel of the task, its value while the lines are off, and while they are on."""
 
 RESERVED = (-50103, -200022, -200587)
 CHAN_FOR_ALL_LINES, VOLTS = 1, 10348
@@ -25,11 +25,11 @@ NOW = (ctypes.c_int32(1), ctypes.c_uint32(1), ctypes.c_double(1.0), ctypes.c_uin
 
 
 class EmergencyError(Exception):
-    """An output could not be switched off; the text says why."""
+    """An output could not be switched off. The text says why."""
 
 
 def prepare(outputs: Sequence[Output]) -> None:
-    """Load NI's driver library; does not touch the cards.
+    """Load NI's driver library without touching the cards.
 
     Raises:
         EmergencyError: It is not there.
@@ -39,13 +39,13 @@ def prepare(outputs: Sequence[Output]) -> None:
 
 
 def off(outputs: Sequence[Output]) -> str:
-    """Write the values of lines that are off to all outputs, also after one that refused.
+    """Write the values of lines that are off to all outputs, even after one refused.
 
     Returns:
         What was done.
 
     Raises:
-        EmergencyError: An output refused; the text is NI's.
+        EmergencyError: An output refused. The text is NI's.
     """
     library, failures = load(), list[str]()
     for kind, channel, low, high in outputs:
@@ -72,7 +72,7 @@ def load() -> Any:
 
 
 def _write(library: Any, kind: str, channel: str, low: float, high: float) -> tuple[int, str]:
-    """Write one value without a clock; returns NI's code and, if it refused, its text."""
+    """Write one value without a clock. Returns NI's code and, if it refused, its text."""
     task, name, written = ctypes.c_void_p(), channel.encode(), ctypes.c_int32()
     code = int(library.DAQmxCreateTask(b"", ctypes.byref(task)))
     if kind == "do":

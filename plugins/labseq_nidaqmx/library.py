@@ -1,4 +1,4 @@
-"""NI's driver library and its Python package, or the one of the simulator package below the same package."""
+"""NI's driver library or the simulator's, below NI's Python package."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EMERGENCY = Path(__file__).with_name("emergency.py")
 
 
 def simulated_settings() -> dict[str, str] | str:
-    """Settings of simulated cards, which NI's Python package plays on, or why there is none here."""
+    """Settings of simulated cards for NI's Python package, or why there is none here."""
     return missing_package("nidaqmx", "nidaqmx") or {"driver": "simulated"}
 
 
@@ -40,12 +40,12 @@ class InstalledLibrary:
             package.system.System.local()  # which loads the library
         except (package.errors.DaqNotFoundError, package.errors.DaqNotSupportedError) as error:
             text = "NI-DAQmx is not installed, or not for this system; install it from ni.com/downloads"
-            hint = "to try things without a card, set `driver: simulated`"
-            raise DeviceError(name, f"{text}; {hint}") from error
+            hint = "To try things without a card, set `driver: simulated`"
+            raise DeviceError(name, f"{text}. {hint}") from error
         return package
 
     def unload(self) -> None:
-        """Nothing to do: a library stays loaded."""
+        """Do nothing, since a library stays loaded."""
 
     def emergency(self, groups: Sequence[OutputGroup]) -> Emergency | None:
         """The script that writes the values of the safe state from another process."""

@@ -1,4 +1,4 @@
-"""The driver: one compiled program of all lines, played by the sample clock of a card."""
+"""The driver, which plays one compiled program of all lines by the sample clock of a card."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ HINTS: Final[Mapping[int, str]] = {
     -200016: "lower `rate`, or use a card on PCI Express",
     -200303: "digital lines of this card need the clock of an analogue output, so put a line on one",
 }
-"""NI's code -> what to do."""
+"""NI's code -> remedy."""
 
 
 class NidaqmxLines(Lines):
@@ -69,7 +69,7 @@ class NidaqmxLines(Lines):
 
     @property
     def lines_facts(self) -> LinesFacts:
-        """Limits; the cards are known only once they are open."""
+        """Limits. The cards are known only once they are open."""
         sample_s = 1.0 / self._settings.rate
         return LinesFacts((), sample_s, sample_s, MAX_SAMPLES)
 
@@ -100,7 +100,7 @@ class NidaqmxLines(Lines):
         self._set(idle_program(self._specs))
 
     def close(self) -> None:
-        """Turn all lines off and release the cards; legal in any state."""
+        """Turn all lines off and release the cards. Legal in any state."""
         try:
             self.safe_state()
         finally:
@@ -112,7 +112,7 @@ class NidaqmxLines(Lines):
             self._set(off_program(self._specs))
 
     def emergency(self) -> Emergency | None:
-        """Writes the levels of lines that are off."""
+        """A script that writes the levels of lines that are off."""
         return None if self._package is None else self._library.emergency(self._groups)
 
     def check_program(self, program: LineProgram) -> None:
@@ -124,7 +124,7 @@ class NidaqmxLines(Lines):
         sample_counts(program, self._settings.rate, self._name)
 
     def compile(self, program: LineProgram) -> None:
-        """Write a program to the cards for the next firing; the program that they hold is not written again.
+        """Write a program to the cards for the next firing, unless they hold it already.
 
         Raises:
             LimitError: Edges closer together than a sample, or too many samples.
@@ -155,7 +155,7 @@ class NidaqmxLines(Lines):
             self._is_armed = True
 
     def fire(self) -> None:
-        """Start the first task, or let the edge at its trigger start it; returns at once."""
+        """Start the first task, or let the edge at its trigger start it, and return at once."""
         with self._calls():
             if not self._is_armed or self._compiled is None:
                 raise DeviceError(self._name, "fired, but not armed; call arm() before each fire()")
@@ -233,7 +233,7 @@ class NidaqmxLines(Lines):
             raise LimitError(what, came, f"at most {limit}", setting=("lines", "rate"))
 
     def _task(self, ni: Any, group: OutputGroup) -> Any:
-        """A new task with the outputs of a group; it is ended with the others."""
+        """A new task with the outputs of a group, which is ended with the others."""
         task = ni.Task()
         self._tasks.append(task)
         for channel, low, high in zip(group.channels, group.low, group.high, strict=True):
@@ -245,7 +245,7 @@ class NidaqmxLines(Lines):
         return task
 
     def _write(self, ni: Any, group: OutputGroup, samples: NDArray[Any]) -> None:
-        """Make the task of a group, with its timing and samples, as ready as it can be without starting."""
+        """Make the task of a group with its timing and samples, ready to start."""
         is_first, task = not self._tasks, self._task(ni, group)
         leader = self._groups[0]
         source = "" if is_first else f"/{leader.device}/{leader.kind}/SampleClock"
@@ -257,7 +257,7 @@ class NidaqmxLines(Lines):
         task.control(ni.constants.TaskMode.TASK_COMMIT)
 
     def _writer(self, ni: Any, group: OutputGroup, task: Any, *, auto_start: bool) -> Any:
-        """What writes (n_channels, n_samples) to a task."""
+        """The writer of (n_channels, n_samples) to a task."""
         writers = ni.stream_writers
         if group.kind == "do":
             digital = writers.DigitalMultiChannelWriter(task.out_stream, auto_start)
@@ -265,7 +265,7 @@ class NidaqmxLines(Lines):
         return writers.AnalogMultiChannelWriter(task.out_stream, auto_start).write_many_sample
 
     def _set(self, program: LineProgram) -> None:
-        """End all tasks, and write the last states of a program without a clock; the outputs hold them."""
+        """End all tasks, and write the last states of a program without a clock. The outputs hold them."""
         self._forget()
         with self._calls() as ni:
             self._end_tasks()
@@ -296,7 +296,7 @@ class NidaqmxLines(Lines):
         self._end_s = -math.inf
 
     def _end_tasks(self) -> None:
-        """End all tasks, also if one of them cannot be ended."""
+        """End all tasks, even if one of them cannot be ended."""
         with ExitStack() as stack:
             while self._tasks:
                 stack.callback(self._tasks.pop().close)

@@ -1,4 +1,4 @@
-"""Which outputs of which cards the lines are, and a program of the lines as samples for them."""
+"""Outputs of the lines on the cards, and programs of the lines as samples for them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from labseq.plugin import ConfigError, LimitError, LineProgram, LineSpec, format
 from labseq_nidaqmx.settings import LevelSettings
 
 MAX_SAMPLES: Final = 30_000_000
-"""Most samples of a program: 120 MB for each port, 240 MB for each analogue output."""
+"""Most samples of a program, 120 MB for each port, 240 MB for each analogue output."""
 _DIGITAL: Final = re.compile(r"(?P<port>(?P<device>[^/]+)/port\d+)/line(?P<bit>[12]?\d|3[01])", re.IGNORECASE)
 _ANALOGUE: Final = re.compile(r"(?P<device>[^/]+)/ao\d+", re.IGNORECASE)
 
@@ -26,8 +26,8 @@ class OutputGroup:
     Attributes:
         device: Name of the card, "Dev1".
         kind: "ao" or "do", as NI-DAQmx calls analogue and digital outputs.
-        channels: What makes each channel of the task: an analogue output, or lines of a port, with commas.
-        low: (n_channels, n_lines), what each line that is off adds to the value of each channel.
+        channels: Outputs of each channel of the task, an analogue output or lines of a port, with commas.
+        low: (n_channels, n_lines), contribution of each line that is off to the value of each channel.
         high: The same for each line that is on.
     """
 
@@ -56,9 +56,9 @@ class _Output(NamedTuple):
     Attributes:
         kind: "ao" or "do".
         device: Name of its card.
-        channel: Channel of the task: the output itself, or its port.
+        channel: Channel of the task, which is the output itself or its port.
         name: Its name.
-        low: What it adds to the channel's value while the line is off.
+        low: Its contribution to the channel's value while the line is off.
         high: The same while it is on.
     """
 
@@ -81,7 +81,7 @@ def output_groups(
         device: Name of the lines in the profile, for messages.
 
     Raises:
-        ConfigError: A channel is not a name of NI's, or a line has no levels, or levels of no use.
+        ConfigError: A channel is not a name of NI's, or a line has no levels, or useless ones.
     """
     if unknown := [name for name in levels if name not in {spec.name for spec in specs}]:
         raise ConfigError(f"{device}: 'levels' has '{unknown[0]}', which is not a line of 'channels'")
@@ -119,7 +119,7 @@ def _output(spec: LineSpec, level: LevelSettings | None, device: str) -> _Output
 
 
 def sample_counts(program: LineProgram, rate_hz: float, device: str) -> NDArray[np.int64]:
-    """For how many samples each edge's states last; the program ends with one sample of the last ones.
+    """For how many samples each edge's states last. The program ends with one sample of the last states.
 
     Raises:
         LimitError: Edges closer together than a sample, or more samples than ``MAX_SAMPLES``.

@@ -58,7 +58,7 @@ class NidaqmxSettings(Settings):
         default={}, description="name of each line on an analogue output -> its levels"
     )
     faults: FaultSettings = Field(
-        default=FaultSettings(), description="the simulated cards, and what goes wrong with them"
+        default=FaultSettings(), description="the simulated cards and their failures"
     )
 
     @property
@@ -67,5 +67,5 @@ class NidaqmxSettings(Settings):
         return self.driver == "simulated"
 
     def identities(self) -> tuple[str, ...] | None:
-        """What only one process can use of it: NI-DAQmx itself keeps others from cards in use."""
+        """None, since NI-DAQmx itself keeps other processes from cards in use."""
         return () if self.is_simulated else None

@@ -24,14 +24,14 @@ VERSION: Final = {0x1272: 24, 0x1923: 8, 0x2F22: 0}
 """Attribute of the system -> part of the version of NI-DAQmx."""
 DEVICE_NAMES: Final = 0x193B
 _loaded: Final[list[Any]] = []
-"""The libraries in use, the last one on top; first what the package had before them."""
+"""The libraries in use, the last one on top, after the package's earlier library."""
 
 
 class SimulatedLibrary:
-    """What the driver gets in place of the installed NI-DAQmx.
+    """The simulator that replaces the installed NI-DAQmx.
 
     Attributes:
-        computer: The simulated computer, whose cards can be looked at.
+        computer: The simulated computer with its cards, for tests.
     """
 
     def __init__(self, settings: NidaqmxSettings, context: Context) -> None:
@@ -55,22 +55,22 @@ class SimulatedLibrary:
         _install()
 
     def emergency(self, groups: Sequence[OutputGroup]) -> Emergency | None:
-        """None: simulated cards end with the process."""
+        """None, since simulated cards end with the process."""
         del groups
 
 
 def _install() -> None:
-    """Let the package call the library on top; its own attributes are the only place to do so."""
+    """Let the package call the library on top, which only works through its own attributes."""
     vars(importlib.import_module("nidaqmx._lib").lib_importer).update(
         _windll=_loaded[-1], _cdll=_loaded[-1], _encoding="utf-8" if len(_loaded) > 1 else None
     )
 
 
 class Function:
-    """A function of the library: it checks the types of its arguments, as ctypes does, and returns a code.
+    """A function of the library, which checks the types of its arguments, as ctypes does, and returns a code.
 
     Attributes:
-        argtypes: What the caller says that the arguments are; None before it has.
+        argtypes: The caller's types of the arguments, None before it sets them.
         arg_lock: For the caller.
     """
 
@@ -87,7 +87,7 @@ class Function:
 
 
 def _plain(argument: Any) -> Any:
-    """Numbers and text of arguments; references give what they refer to."""
+    """Numbers and text of arguments, which references point to."""
     if isinstance(argument, bytes):
         return argument.decode()
     if hasattr(argument, "_obj"):
@@ -96,7 +96,7 @@ def _plain(argument: Any) -> Any:
 
 
 class Functions:
-    """NI's functions, by their names in C; others are missing, as in an old NI-DAQmx."""
+    """NI's functions, by their names in C. Others are missing, as in an old NI-DAQmx."""
 
     def __init__(self, computer: Computer) -> None:
         self._computer = computer
@@ -222,7 +222,7 @@ class Functions:
 
 
 def _put_text(out: Any, text: str, size: int) -> int:
-    """Write a text to a buffer; returns the size that it needs for a buffer of no size."""
+    """Write a text to a buffer. Returns the size that it needs for a buffer of no size."""
     if not size:
         return len(text) + 1
     out.value = text.encode()

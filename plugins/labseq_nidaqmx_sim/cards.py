@@ -1,4 +1,4 @@
-"""The cards that can be simulated, NI's codes, and what the outputs of all cards do."""
+"""The cards that can be simulated, NI's codes, and the outputs of all cards."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from labseq.plugin import Context, LineProgram
 
 
 class Code(IntEnum):
-    """NI's codes for what a call may be refused for."""
+    """NI's codes for refused calls."""
 
     RESERVED = -50103
     NO_SUCH_TERMINAL = -89120
@@ -77,7 +77,7 @@ class Refused(Exception):  # noqa: N818 - a call is refused, which is no error o
 
 @dataclass(frozen=True, slots=True)
 class CardModel:
-    """What a product can do, from its data sheet.
+    """Limits of a product, from its data sheet.
 
     Attributes:
         ports: Number of lines of each port.
@@ -85,7 +85,7 @@ class CardModel:
         has_do_clock: Whether it makes a sample clock for its lines itself.
         do_rate_hz: Highest rate of their clock.
         n_ao: Number of analogue outputs.
-        ao_rates_hz: Highest rate of one, two, ... analogue outputs together; empty: on demand only.
+        ao_rates_hz: Highest rate of one, two, ... analogue outputs together, empty for on demand only.
         ao_range_v: Least and highest voltage.
     """
 
@@ -156,7 +156,7 @@ class Outputs:
     def _state(
         self, i: int, levels: Mapping[str, NDArray[Any]], edges: NDArray[np.int64]
     ) -> Sequence[bool] | NDArray[np.bool_]:
-        """Whether a line is on at each edge: its level is nearer to that for on than to that for off."""
+        """Whether a line is on at each edge, as its level is nearer to its on level than to its off level."""
         name = self._names[i]
         samples = levels.get(name)
         if samples is None:

@@ -1,4 +1,4 @@
-"""Tasks of the simulated NI-DAQmx: what each call refuses, and what a task plays."""
+"""Tasks of the simulated NI-DAQmx, with their refusals and their playing."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ class Channel:
 
 @dataclass(slots=True, eq=False)
 class Task:
-    """A task: its channels, timing and samples.
+    """A task with its channels, timing and samples.
 
     Attributes:
-        rate_hz: Rate of its sample clock; 0: on demand.
-        source: Terminal of that clock in small letters; empty: the card's own.
+        rate_hz: Rate of its sample clock, 0 for on demand.
+        source: Terminal of that clock in small letters, empty for the card's own.
         n_samples: Samples of a channel after which it is done.
-        trigger: Terminal of its start trigger; empty: none.
-        samples: (n_channels, n_written); None before they were written.
+        trigger: Terminal of its start trigger, empty for none.
+        samples: (n_channels, n_written), None before they were written.
         is_reserved: Whether other tasks cannot have its outputs.
         is_running: Whether it was started, and not stopped.
-        begin_s: When its first sample came; inf before.
+        begin_s: When its first sample came, inf before.
     """
 
     channels: list[Channel] = field(default_factory=list["Channel"])
@@ -88,7 +88,7 @@ class Task:
 
 
 class Computer:
-    """A computer with NI-DAQmx, whose cards are those that the lines of a profile name."""
+    """A computer with NI-DAQmx and the cards that the lines of a profile name."""
 
     def __init__(self, settings: NidaqmxSettings, context: Context) -> None:
         self._faults = settings.faults
@@ -103,7 +103,7 @@ class Computer:
         self._is_unplugged = False
 
     def new_task(self) -> int:
-        """Make a task; returns its handle."""
+        """Make a task, and return its handle."""
         self._n_made += 1
         self.tasks[self._n_made] = Task()
         return self._n_made
@@ -167,7 +167,7 @@ class Computer:
         task.trigger = terminal
 
     def write(self, task: Task, samples: NDArray[Any], n_samples: int, *, auto_start: bool) -> int:
-        """Write samples (n_channels, n_samples); returns how many of a channel were taken."""
+        """Write samples (n_channels, n_samples), and return how many of a channel were taken."""
         self._reach(task)
         if samples.size != n_samples * len(task.channels):
             raise Refused(Code.CHANNELS_MISMATCH)
@@ -222,14 +222,16 @@ class Computer:
             is_timed = all(int(output["port"]) in model.timed_ports for output in outputs)
             fastest_hz = model.do_rate_hz if is_timed else 0.0
         if not fastest_hz:
-            raise Refused(Code.INVALID_VALUE, "sample clock; supported: on demand")
+            raise Refused(Code.INVALID_VALUE, "sample clock (supported: on demand)")
         if not 0 < task.rate_hz <= fastest_hz:
-            raise Refused(Code.INVALID_VALUE, f"rate {task.rate_hz:g} Hz; supported: up to {fastest_hz:g} Hz")
+            raise Refused(
+                Code.INVALID_VALUE, f"rate {task.rate_hz:g} Hz (at most {fastest_hz:g} Hz)"
+            )
         if task.kind == "do" and not model.has_do_clock and not task.source:
             raise Refused(Code.NO_CLOCK_SOURCE)
 
     def start(self, task: Task) -> None:
-        """Start a task; one with the clock of another waits for that."""
+        """Start a task. A task with another's clock waits for it."""
         self._refuse_running(task)
         self.reserve(task)
         if not task.rate_hz:
@@ -244,7 +246,7 @@ class Computer:
             self._begin(task)
 
     def _begin(self, leader: Task) -> None:
-        """The clock of a task begins, also for those that wait for it."""
+        """Begin the clock of a task, also for tasks that wait for it."""
         waiting = [task for task in self.tasks.values() if task.is_running and task.begin_s == math.inf]
         playing = [task for task in waiting if task is leader or task.source == leader.clock]
         for task in playing:
@@ -261,7 +263,7 @@ class Computer:
         return not task.is_running or self.left_s(task) <= ROUNDING_S
 
     def left_s(self, task: Task) -> float:
-        """Time until a running task is done, in seconds; inf if its clock has not begun."""
+        """Time until a running task is done, in seconds, inf if its clock has not begun."""
         played_s, underflow_s = self._clock.now() - task.begin_s, self._faults.underflow
         duration_s = task.n_samples / task.rate_hz if task.rate_hz else 0.0
         if underflow_s is not None and underflow_s < min(duration_s, played_s):
@@ -276,7 +278,7 @@ class Computer:
             self._clock.sleep(self.left_s(task))
 
     def stop(self, task: Task) -> None:
-        """Stop a task, which keeps its samples; its outputs hold their levels."""
+        """Stop a task, which keeps its samples. Its outputs hold their levels."""
         is_done = self.is_done(task)
         self._hold(task)
         task.is_running = False
@@ -284,13 +286,13 @@ class Computer:
             raise Refused(Code.STOPPED_BEFORE_DONE)
 
     def clear(self, handle: int | None) -> None:
-        """End a task; its outputs hold their levels."""
+        """End a task. Its outputs hold their levels."""
         task = self.task(handle)
         self._hold(task)
         self.tasks = {number: other for number, other in self.tasks.items() if other is not task}
 
     def reset(self, device: str) -> None:
-        """End the tasks of a card, those of other programs too; all its outputs go to 0."""
+        """End the tasks of a card, other programs' too. All its outputs go to 0."""
         if device.lower() not in {card.lower() for card in self.cards}:
             raise Refused(Code.NO_SUCH_DEVICE, device)
         self._faults = self._faults.model_copy(update={"in_use": False})
@@ -301,7 +303,7 @@ class Computer:
         }
 
     def _hold(self, task: Task) -> None:
-        """Outputs of a task that is ended in the middle of its samples keep the levels of that moment."""
+        """Keep the present levels of a task that is ended in the middle of its samples."""
         if not task.is_running or task.samples is None:
             return
         played_s = self._clock.now() - task.begin_s
@@ -326,7 +328,7 @@ class Computer:
 def _levels(
     tasks: Sequence[Task], n_samples: int, samples: Mapping[Task, NDArray[Any]] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """The levels of all outputs of tasks, which repeat what was written until they have enough samples."""
+    """The levels of all outputs of tasks, which repeat written samples until they have enough."""
     levels: dict[str, NDArray[Any]] = {}
     for task in tasks:
         written = task.samples if samples is None else samples[task]

@@ -7,7 +7,7 @@ LABSEQ_API = 1
 
 @hookimpl
 def labseq_register(registry: Registry) -> None:
-    """Offer the lines ``pulseblaster``; in a dry run the board is simulated."""
+    """Offer the lines ``pulseblaster``, with a simulated board in a dry run."""
     registry.lines(
         "pulseblaster",
         "labseq_pulseblaster.lines:PulseBlasterLines",

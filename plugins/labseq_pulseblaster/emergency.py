@@ -20,11 +20,11 @@ HOLD_NS = 1e6
 
 
 class SpinapiError(Exception):
-    """A call was refused; the text is SpinCore's."""
+    """A call was refused. The text is SpinCore's."""
 
 
 def prepare(**board: Any) -> None:
-    """Load SpinCore's library; does not touch the board.
+    """Load SpinCore's library without touching the board.
 
     Raises:
         SpinapiError: It is not there.
@@ -88,14 +88,14 @@ def connect(library: Any, board_number: int, clock_mhz: float) -> None:
 def hold(library: Any, flags: int) -> None:
     """Let the board repeat these flags for ever.
 
-    Its outputs then do not depend on what its firmware does with them after the end of a program.
+    Its outputs then do not depend on the firmware's levels after the end of a program.
     """
     write(library, [(flags, CONTINUE, 0, HOLD_NS), (flags, BRANCH, 0, HOLD_NS)])
     call(library, "pb_start")
 
 
 def write(library: Any, instructions: Iterable[tuple[int, int, int, float]]) -> None:
-    """Stop the board and write a program: flags, code, data and length in nanoseconds of each instruction."""
+    """Stop the board and write a program of instructions (flags, code, data and length in nanoseconds)."""
     call(library, "pb_stop")
     call(library, "pb_start_programming", 0)
     for instruction in instructions:

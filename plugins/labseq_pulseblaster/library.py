@@ -1,4 +1,4 @@
-"""SpinCore's library, or the one of the simulator package with the same functions."""
+"""SpinCore's library, or the simulator's with the same functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The driver: one compiled program of all lines, played by the board's clock."""
+"""The driver, which plays one compiled program of all lines by the board's clock."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class PulseBlasterLines(Lines):
         self._rest(idle_program(self._specs))
 
     def close(self) -> None:
-        """Turn all lines off, which the board goes on doing, and disconnect; legal in any state."""
+        """Turn all lines off and disconnect, while the board keeps them off. Legal in any state."""
         try:
             self.safe_state()
         finally:
@@ -94,7 +94,7 @@ class PulseBlasterLines(Lines):
             self._rest(off_program(self._specs))
 
     def emergency(self) -> Emergency | None:
-        """Stops the board, and lets it hold the levels of lines that are off."""
+        """A script that stops the board, and lets it hold the levels of lines that are off."""
         if self._spinapi is None:
             return None
         flags = self._last_flags(off_program(self._specs))
@@ -109,7 +109,7 @@ class PulseBlasterLines(Lines):
         instructions_of(program, self._specs, self._model, self._name)
 
     def compile(self, program: LineProgram) -> None:
-        """Write a program to the board for the next firing; one that it holds is not written again.
+        """Write a program to the board for the next firing, unless it holds it already.
 
         Raises:
             LimitError: Edges closer together, or more of them, than the board can make.
@@ -134,7 +134,7 @@ class PulseBlasterLines(Lines):
             self._is_armed = True
 
     def fire(self) -> None:
-        """Start the program, or let the edge at the trigger input start it; returns at once."""
+        """Start the program, or let the edge at the trigger input start it, and return at once."""
         with self._calls() as spinapi:
             if not self._is_armed or self._compiled is None:
                 raise DeviceError(self._name, "fired, but not armed; call arm() before each fire()")
@@ -162,7 +162,7 @@ class PulseBlasterLines(Lines):
             self._is_running = False
 
     def self_test(self) -> None:
-        """Play a program that changes no line, and look whether the clock is that of the model.
+        """Play a program that changes no line, and check that the clock is the model's.
 
         Raises:
             DeviceError: The program ended too early.
@@ -176,7 +176,7 @@ class PulseBlasterLines(Lines):
             with self._calls():
                 if self._is_stopped():
                     text = "a program ended before 80 % of its time, so the board's clock is faster than"
-                    raise DeviceError(self._name, f"{text} that of the 'model', {self._settings.model}")
+                    raise DeviceError(self._name, f"{text} the clock of 'model', {self._settings.model}")
         self.wait(TEST_S)
         self._rest(self._resting)
 

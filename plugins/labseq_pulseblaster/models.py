@@ -29,7 +29,7 @@ class Instruction(NamedTuple):
 
     Attributes:
         flags: Bit n is output n.
-        code: What follows it.
+        code: Action that follows it.
         data: Number of repetitions of a long delay, or address of a branch.
         cycles: Its length in clock cycles.
     """

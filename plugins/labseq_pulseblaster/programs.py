@@ -35,7 +35,7 @@ def flags_of(on: Sequence[bool], specs: Sequence[LineSpec], model: Model) -> int
 def instructions_of(
     program: LineProgram, specs: Sequence[LineSpec], model: Model, device: str
 ) -> tuple[Instruction, ...]:
-    """The instructions of a program; the last one stops the board, which holds the levels before it.
+    """The instructions of a program. The last one stops the board, which holds the levels before it.
 
     Raises:
         LimitError: Edges closer together than the shortest instruction, or too many instructions.
@@ -51,7 +51,7 @@ def instructions_of(
         shortest = format_quantity(model.shortest / model.clock_hz, "time")
         came = format_quantity(t_s - before_s, "time")
         raise LimitError(between, came, f"at least {shortest}", "change a lead, a lag or a pulse")
-    # a long pause needs two instructions; STOP and the two of ``waiting`` need room, too
+    # a long pause needs two instructions, and STOP and the two of ``waiting`` need room, too
     n_instructions, most = len(steps) + int((steps > LONGEST).sum()), model.n_instructions - 3
     if n_instructions > most:
         raise LimitError(f"{what}: number of instructions", n_instructions, f"at most {most}")
@@ -72,7 +72,7 @@ def _delay(flags: int, cycles: int) -> Iterator[Instruction]:
 
 
 def waiting(flags: int, model: Model) -> tuple[Instruction, ...]:
-    """What precedes a program that waits for the trigger input.
+    """The instructions before a program that waits for the trigger input.
 
     A WAIT must follow an instruction that is longer than the shortest.
     """

@@ -11,12 +11,12 @@ from labseq_pulseblaster.models import MODELS, Model
 
 
 class FaultSettings(Settings):
-    """What goes wrong with the simulated board."""
+    """Failures of the simulated board."""
 
     missing: bool = Field(default=False, description="no board is connected")
     in_use: bool = Field(default=False, description="another program holds the board")
     clock: Annotated[Frequency, Field(gt=0)] | None = Field(
-        default=None, description="clock of the board, if it is not that of its `model`"
+        default=None, description="clock of the board, if it differs from the clock of its `model`"
     )
     unplugged: bool = Field(default=False, description="the board does not answer once a program was fired")
     no_edge: bool = Field(default=False, description="the edge at the trigger input never comes")
@@ -30,16 +30,14 @@ class PulseBlasterSettings(Settings):
     )
     model: Literal[
         "PB24-100-4k", "PB24-100-32k", "PBESR-PRO-250", "PBESR-PRO-300", "PBESR-PRO-400", "PBESR-PRO-500"
-    ] = Field(description="the board; its library does not know its clock and memory")
+    ] = Field(description="the board, since its library does not know its clock and memory")
     board_number: Annotated[int, Field(ge=0)] = Field(
         default=0, description="which of several boards, as SpinAPI counts them from 0"
     )
     external_trigger: bool = Field(
         default=False, description="an edge at the board's trigger input starts a program that was fired"
     )
-    faults: FaultSettings = Field(
-        default=FaultSettings(), description="what goes wrong with the simulated board"
-    )
+    faults: FaultSettings = Field(default=FaultSettings(), description="failures of the simulated board")
 
     @property
     def is_simulated(self) -> bool:
@@ -48,9 +46,9 @@ class PulseBlasterSettings(Settings):
 
     @property
     def facts(self) -> Model:
-        """What the board can do."""
+        """Limits of the board."""
         return MODELS[self.model]
 
     def identities(self) -> tuple[str, ...]:
-        """What only one process can use of it."""
+        """Names of the board, which only one process can use."""
         return () if self.is_simulated else (f"SpinCore board {self.board_number}",)

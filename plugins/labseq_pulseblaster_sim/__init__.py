@@ -1,4 +1,4 @@
-"""A simulator of SpinAPI for ``labseq_pulseblaster``: a board behind the functions of the C library."""
+"""A simulator of SpinAPI for ``labseq_pulseblaster``, a board behind the functions of the C library."""
 
 from labseq_pulseblaster_sim.access import SimulatedLibrary
 

@@ -1,4 +1,4 @@
-"""The simulated library: functions with the names and arguments of those of SpinAPI."""
+"""The simulated library, whose functions have SpinAPI's names and arguments."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from labseq_pulseblaster_sim.board import Board, Refused
 
 
 class SimulatedLibrary:
-    """What the driver gets in place of the installed SpinAPI.
+    """The simulator that replaces the installed SpinAPI.
 
     Attributes:
-        board: The simulated board, which can be looked at.
+        board: The simulated board, for tests.
     """
 
     def __init__(self, settings: PulseBlasterSettings, context: Context) -> None:
@@ -27,7 +27,7 @@ class SimulatedLibrary:
         return Spinapi(self.board)
 
     def emergency(self, board_number: int, clock_mhz: float, flags: int) -> Emergency | None:
-        """None: a simulated board ends with the process."""
+        """None, since a simulated board ends with the process."""
         del board_number, clock_mhz, flags
 
 
@@ -63,7 +63,7 @@ class Spinapi:
         return self._run(self._board.open)
 
     def pb_close(self) -> int:
-        """Close it; it goes on with its program."""
+        """Close it. It goes on with its program."""
         return self._run(self._board.close)
 
     def pb_core_clock(self, clock_mhz: float) -> None:
@@ -75,7 +75,7 @@ class Spinapi:
         return self._run(lambda: self._board.start_programming(device))
 
     def pb_inst_pbonly(self, flags: int, code: int, data: int, length_ns: float) -> int:
-        """Write an instruction; returns its address."""
+        """Write an instruction, and return its address."""
         return self._run(lambda: self._board.add(flags, code, data, length_ns))
 
     def pb_stop_programming(self) -> int:
@@ -87,15 +87,15 @@ class Spinapi:
         return self._run(self._board.start)
 
     def pb_stop(self) -> int:
-        """Stop it; the next start begins at its first instruction."""
+        """Stop it. The next start begins at its first instruction."""
         return self._run(self._board.reset)
 
     def pb_reset(self) -> int:
-        """Stop it; the next start begins at its first instruction."""
+        """Stop it. The next start begins at its first instruction."""
         return self._run(self._board.reset)
 
     def pb_read_status(self) -> int:
-        """Bits: stopped, reset, running, waiting."""
+        """The status bits stopped, reset, running, waiting."""
         return self._run(self._board.status)
 
     def _run(self, call: Callable[[], int | None]) -> int:

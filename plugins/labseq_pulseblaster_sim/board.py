@@ -1,4 +1,4 @@
-"""The simulated board: what it refuses, and what its outputs do."""
+"""The simulated board with its refusals and its outputs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Status(IntFlag):
 
 
 class Refused(Exception):  # noqa: N818 - a call is refused, which is no error of the simulator
-    """A call is refused; the text says why."""
+    """A call is refused. The text says why."""
 
 
 class Board:
@@ -34,9 +34,9 @@ class Board:
 
     Attributes:
         n_boards: Number of boards that the library finds.
-        told_mhz: Clock that the program has told the library; 0: none.
+        told_mhz: Clock that the program has told the library, 0 for none.
         program: The instructions in its memory.
-        flags: Those of its outputs.
+        flags: Flags of its outputs.
     """
 
     firmware = 0x0A01
@@ -71,7 +71,7 @@ class Board:
         self._is_open, self._is_reset = True, True
 
     def close(self) -> None:
-        """Close it; it goes on with its program."""
+        """Close it. It goes on with its program."""
         self._reach()
         self._is_open = False
 
@@ -87,7 +87,7 @@ class Board:
         self.program, self._is_written = [], True
 
     def add(self, flags: int, code: int, data: int, length_ns: float) -> int:
-        """Write an instruction; returns its address."""
+        """Write an instruction, and return its address."""
         self._reach()
         if not self._is_written:
             raise Refused("no program is being written; call pb_start_programming")
@@ -144,7 +144,7 @@ class Board:
         self._is_unplugged = self._faults.unplugged
 
     def reset(self) -> None:
-        """Stop; outputs keep the levels of that moment."""
+        """Stop. Outputs keep the levels of that moment."""
         self._reach()
         now_s = self._clock.now()
         if now_s < self._end_s - ROUNDING_S:
@@ -154,7 +154,7 @@ class Board:
         self._is_reset, self._is_waiting, self._end_s = True, False, -math.inf
 
     def status(self) -> int:
-        """What it does."""
+        """Its present state."""
         self._reach()
         if self._is_reset:
             return Status.STOPPED | Status.RESET
@@ -163,7 +163,7 @@ class Board:
         return Status.RUNNING if self._clock.now() < self._end_s - ROUNDING_S else Status.STOPPED
 
     def _play(self, instructions: list[Instruction]) -> None:
-        """Play instructions from now on, up to the end of the last; one that branches back never ends."""
+        """Play instructions from now on, up to the end of the last. A branch back never ends."""
         clock_hz = self._faults.clock or self._model.clock_hz
         cycles, steps = 0, list[tuple[float, int]]()
         for flags, code, data, length in instructions:
@@ -175,7 +175,7 @@ class Board:
         self._show(steps, cycles / clock_hz)
 
     def _show(self, steps: list[tuple[float, int]], duration_s: float) -> None:
-        """Outputs take these flags from now on; the simulation receives the states of the lines."""
+        """Set the flags of the outputs from now on. The simulation receives the states of the lines."""
         self._played, self._begin_s = steps, self._clock.now()
         self.flags = steps[-1][1]
         states = [self._states(flags) for _, flags in steps]
@@ -188,7 +188,7 @@ class Board:
             self._simulation.play("lines", program, self._clock.now())
 
     def _states(self, flags: int) -> list[bool]:
-        """Which lines are on; outputs of a board with the short pulse feature are low without its bits."""
+        """Which lines are on. Outputs of a board with the short pulse feature are low without its bits."""
         has_short_pulses = self._model.fixed_flags == SHORT_PULSE_BITS
         high = 0 if has_short_pulses and not flags & SHORT_PULSE_BITS else flags
         return [bool(high >> int(spec.channel) & 1) != spec.active_low for spec in self._specs]

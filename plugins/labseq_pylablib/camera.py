@@ -16,13 +16,13 @@ from labseq_pylablib.interfaces import connection_for
 from labseq_pylablib.settings import PylablibSettings
 
 ROUNDING = 1e-3
-"""Relative difference of exposures that counts as rounding: cameras expose for whole rows."""
+"""Relative difference of exposures that counts as rounding, since cameras expose for whole rows."""
 
 
 class PylablibCamera(SdkCamera):
-    """A camera through pylablib: Hamamatsu DCAM, Andor SDK3, PICam, Photometrics, PCO.
+    """A camera through pylablib (Hamamatsu DCAM, Andor SDK3, PICam, Photometrics, PCO).
 
-    These cameras have no EM gain here, and no shutter; the cooler stays on in the safe state and after the
+    These cameras have no EM gain here, and no shutter. The cooler stays on in the safe state and after the
     camera is closed.
 
     Attributes:
@@ -48,7 +48,7 @@ class PylablibCamera(SdkCamera):
 
     @property
     def facts(self) -> CameraFacts:
-        """Limits of the camera; read-out time and triggers are the camera's once it was opened."""
+        """Limits of the camera. Read-out time and triggers are the camera's once it was opened."""
         shape = self._settings.frame_shape(self._sensor_shape)
         if self._triggers is None:
             return self._settings.facts(self._readout_s, shape)
@@ -59,7 +59,7 @@ class PylablibCamera(SdkCamera):
         self.connection.warm()
 
     def describe(self) -> Mapping[str, Any]:
-        """Settings; once opened, also what the camera reports, and its temperature."""
+        """Settings, and once opened also the camera's report and its temperature."""
         settings = self._settings.model_dump(mode="json")
         described = {**settings, "model": self._settings.model or "camera of pylablib", **self._reported}
         described |= {"readout_s": self._readout_s, "frame_shape": self.facts.frame_shape}
@@ -70,7 +70,7 @@ class PylablibCamera(SdkCamera):
         return described
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
-        """That of the firmware; no real camera was tried."""
+        """Version of the firmware. No real camera was tried."""
         return {"firmware": (self._reported.get("firmware", ""), "")}
 
     # open and close
@@ -133,7 +133,7 @@ class PylablibCamera(SdkCamera):
         return self.connection.take(self._look, timeout_s)
 
     def _look(self, wait_s: float) -> ExposureResult | None:
-        """Read the oldest frame; wait for it for at most ``wait_s`` seconds."""
+        """Read the oldest frame, and wait for it for at most ``wait_s`` seconds."""
         frame = self.connection.read()
         if frame is None and wait_s > 0:
             if fault := self.connection.wait_in_sdk(wait_s):

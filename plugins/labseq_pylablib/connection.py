@@ -1,4 +1,4 @@
-"""A camera as pylablib shows it: what its five interfaces have in common."""
+"""A camera as pylablib shows it, the common part of its five interfaces."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MEANINGS: Final[Mapping[str, str]] = {
     "PicamError_DeviceDisconnected": _UNPLUGGED,
     "PicamError_CameraFaulted": _UNPLUGGED,
 }
-"""Name of a library's error -> what it means for a user."""
+"""Name of a library's error -> its meaning for a user."""
 IN_USE: Final = frozenset(
     {
         "DCAMERR_EXCLUDED",
@@ -56,8 +56,8 @@ class RawFrame:
     Attributes:
         image: (height, width).
         index: Its place among the frames that reached the computer, from 0.
-        stamp: Number that the camera gave it; None if it gives none.
-        time_s: The camera's time stamp, in seconds; nan if it gives none.
+        stamp: Number that the camera gave it, None if it gives none.
+        time_s: The camera's time stamp, in seconds, nan if it gives none.
     """
 
     image: NDArray[Any]
@@ -70,11 +70,11 @@ class Connection(ABC):
     """A camera through pylablib. A subclass knows one vendor's interface.
 
     Attributes:
-        vendor: Whose cameras.
+        vendor: Vendor of the camera.
         has_falling_edge: Whether pylablib can set a trigger by a falling edge.
         settings: The camera's settings.
-        module: pylablib's module; None before ``open()``.
-        camera: pylablib's camera; None unless it is open.
+        module: pylablib's module, None before ``open()``.
+        camera: pylablib's camera, None unless it is open.
     """
 
     vendor: ClassVar[Vendor]
@@ -89,7 +89,7 @@ class Connection(ABC):
 
     @property
     def sensor_shape(self) -> tuple[int, int] | None:
-        """(height, width) of the sensor; None if it is not known before the camera is opened."""
+        """(height, width) of the sensor, None if it is not known before the camera is opened."""
         return None
 
     @property
@@ -99,7 +99,7 @@ class Connection(ABC):
 
     def warm(self) -> None:
         """Import pylablib, which takes seconds."""
-        with suppress(DeviceError):  # open() reports what is missing
+        with suppress(DeviceError):  # open() reports the missing library
             self.module = self.load()
 
     def load(self) -> Any:
@@ -110,16 +110,16 @@ class Connection(ABC):
 
     @abstractmethod
     def places(self) -> Sequence[Any]:
-        """What opens each connected camera: the argument of pylablib's class."""
+        """Argument of pylablib's class for each connected camera."""
 
     @abstractmethod
     def identity(self) -> tuple[str, str, str]:
-        """Model, serial number and firmware of the open camera; "" where it tells none."""
+        """Model, serial number and firmware of the open camera, "" where it tells none."""
 
     @property
     @abstractmethod
     def readout_s(self) -> float:
-        """From the end of an exposure until its frame can be read, in seconds."""
+        """Time from the end of an exposure until its frame can be read, in seconds."""
 
     @abstractmethod
     def triggers(self) -> tuple[Trigger, ...]:
@@ -127,7 +127,7 @@ class Connection(ABC):
 
     @abstractmethod
     def set_trigger(self, trigger: Trigger) -> None:
-        """Choose what starts the exposures."""
+        """Choose the trigger of the exposures."""
 
     @abstractmethod
     def readout_modes(self) -> Mapping[str, Callable[[], object]]:
@@ -135,14 +135,14 @@ class Connection(ABC):
 
     @abstractmethod
     def read_temperature_c(self) -> float | None:
-        """Temperature of the sensor, in degrees Celsius; None if the camera does not tell it."""
+        """Temperature of the sensor, in degrees Celsius, None if the camera does not tell it."""
 
     @abstractmethod
     def cool(self, celsius: float) -> float | None:
-        """Start to cool; returns the temperature that the camera took, None if it has no cooler."""
+        """Start to cool. Returns the temperature that the camera took, None if it has no cooler."""
 
     def set_cycle(self, cycle_s: float) -> float:
-        """Set the time from one exposure to the next; returns the one that the camera makes, in seconds."""
+        """Set the time from one exposure to the next, and return the camera's, in seconds."""
         raise NotImplementedError(cycle_s)
 
     def stamps(self, info: Any) -> tuple[int | None, float]:
@@ -151,13 +151,13 @@ class Connection(ABC):
         return None, math.nan
 
     def details(self) -> Mapping[str, Any]:
-        """What else the camera knows about its counts: electrons per count, offset in counts."""
+        """Electrons per count and offset in counts, if the camera tells them."""
         return {}
 
     # open and close
 
     def open(self) -> None:
-        """Open the camera with the serial number of the settings; without one, the only camera."""
+        """Open the camera with the serial number of the settings, or without one the only camera."""
         self.module = self.module or self.load()
         wanted, seen, in_use = self.settings.serial, list[str](), list[DeviceError]()
         with self.doing():
@@ -192,7 +192,7 @@ class Connection(ABC):
         raise DeviceError(self.name, f"{text}; change `serial`, or connect the other camera")
 
     def close(self) -> None:
-        """Release the camera; failures are ignored, since nothing can be done about them."""
+        """Release the camera. Failures are ignored, since nothing can be done about them."""
         camera, self.camera = self.camera, None
         if camera is not None:
             with suppress(DeviceError), self.doing():
@@ -200,7 +200,7 @@ class Connection(ABC):
 
     @contextmanager
     def doing(self) -> Generator[Any]:
-        """The camera; errors of pylablib are turned into errors of labseq."""
+        """The camera. Errors of pylablib are turned into errors of labseq."""
         backend: Any = importlib.import_module("pylablib.core.devio.comm_backend")
         try:
             yield self.camera
@@ -208,7 +208,7 @@ class Connection(ABC):
             raise DeviceError(self.name, self._explain(error)) from error
 
     def _explain(self, error: Exception) -> str:
-        """What an error of a vendor's library means for a user, with the function and its code at the end."""
+        """Explain an error of a vendor's library to a user, with the function and its code at the end."""
         code, function = str(getattr(error, "name", "")), getattr(error, "func", "")
         if code in IN_USE:
             program = f"close {self.vendor.program} and every other program that uses it"
@@ -222,14 +222,12 @@ class Connection(ABC):
     # what is set once
 
     def set_up(self) -> dict[str, Any]:
-        """Set what stays the same in all series; returns what the camera reports about itself."""
+        """Set everything that stays the same in all series, and return the camera's report about itself."""
         settings = self.settings
         with self.doing() as camera:
             model, serial, firmware = self.identity()
             if not model.upper().startswith(settings.model.upper()):
-                text = (
-                    f"the connected camera is a {model}; expected a model that begins with {settings.model}"
-                )
+                text = f"the connected camera is a {model}, but `model` is {settings.model}"
                 raise DeviceError(self.name, f"{text}; change `model`, or connect the other camera")
             if settings.trigger_edge == "falling" and not self.has_falling_edge:
                 text = f"pylablib sets no falling edge at {settings.interface} cameras"
@@ -258,7 +256,7 @@ class Connection(ABC):
         modes[wanted]()
 
     def _set_region(self, width: int, height: int) -> None:
-        """Set region and binning; refuses what the camera would change."""
+        """Set region and binning. Refuses values that the camera would change."""
         camera, binning = self.camera, self.settings.binning
         y, x, h, w = self.settings.mode.region or (0, 0, height, width)
         limits = camera.get_roi_limits(binning, binning)
@@ -277,7 +275,7 @@ class Connection(ABC):
             raise DeviceError(self.name, f"{text}, not what `region` and `binning` say; change these")
 
     def _start_cooling(self) -> float | None:
-        """Start to cool; returns the set temperature in kelvins, None if the cooler is left as it is."""
+        """Start to cool. Returns the set temperature in kelvins, None if the cooler is left as it is."""
         cooling = self.settings.cooling
         if cooling is None:
             return None
@@ -286,8 +284,8 @@ class Connection(ABC):
         if made_c is None:
             raise DeviceError(self.name, "this camera has no cooler that can be set; leave `cooling` out")
         if abs(made_c - wanted_c) > cooling.tolerance_k:
-            text = f"cooling: temperature is {wanted_c:.0f} degC; the camera cools to {made_c:.0f} degC"
-            raise DeviceError(self.name, f"{text}; choose one that it can reach")
+            text = f"cooling: temperature is {wanted_c:.0f} degC, but the camera cools to {made_c:.0f} degC"
+            raise DeviceError(self.name, f"{text}; choose a temperature that it can reach")
         return made_c + ZERO_CELSIUS_K
 
     # a series
@@ -307,7 +305,7 @@ class Connection(ABC):
         self.camera.setup_acquisition(mode="snap", nframes=n_frames)
 
     def stop(self) -> None:
-        """End the series; no effect if the camera is closed."""
+        """End the series. No effect if the camera is closed."""
         if self.camera is not None:
             with self.doing() as camera:
                 camera.stop_acquisition()
@@ -319,7 +317,7 @@ class Connection(ABC):
                 raise DeviceError(self.name, _TOO_EARLY)
 
     def read(self) -> RawFrame | None:
-        """The oldest frame that was not read; None if there is none."""
+        """The oldest frame that was not read, None if there is none."""
         with self.doing() as camera:
             taken = camera.read_oldest_image(return_info=True)
         if taken is None:
@@ -329,7 +327,7 @@ class Connection(ABC):
         return RawFrame(np.asarray(image, np.uint16), int(info.frame_index), stamp, time_s)
 
     def wait_in_sdk(self, timeout_s: float) -> str:
-        """Wait for a frame, for at most so many seconds; returns why none will come, "" if one may."""
+        """Wait for a frame, for at most ``timeout_s``. Returns why none will come, "" if one may."""
         with self.doing() as camera:
             try:
                 camera.wait_for_frame(timeout=timeout_s)
@@ -340,5 +338,5 @@ class Connection(ABC):
         return ""
 
     def take(self, look: Callable[[float], ExposureResult | None], timeout_s: float) -> ExposureResult | None:
-        """Wait for a frame on the session's clock; None if none came in time."""
+        """Wait for a frame on the session's clock. None if none came in time."""
         return wait_for(look, timeout_s, self._clock)

@@ -1,6 +1,6 @@
-"""The five interfaces: trigger modes, read-out modes, stamps and cooling, as each vendor calls them.
+"""The five interfaces with the vendors' trigger modes, read-out modes, stamps and cooling.
 
-Numbers of trigger modes are those of the vendors' headers, which pylablib's tables follow.
+Numbers of trigger modes come from the vendors' headers, which pylablib's tables follow.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def connection_for(settings: PylablibSettings, context: Context) -> Connection:
 
 
 class Dcam(Connection):
-    """Hamamatsu's DCAM-API: ORCA-Quest, Fusion, Flash; properties by the names of ``dcamprop.h``."""
+    """Hamamatsu's DCAM-API (ORCA-Quest, Fusion, Flash), with properties by the names of ``dcamprop.h``."""
 
     vendor: ClassVar[Vendor] = DCAM
     has_falling_edge: ClassVar[bool] = True
@@ -74,7 +74,7 @@ class Dcam(Connection):
         )
 
     def set_trigger(self, trigger: Trigger) -> None:
-        """Set the three properties, and the polarity; the source first, on which the others depend."""
+        """Set the three properties, and the polarity, the source first, since the others depend on it."""
         for name, value in zip(self.PROPERTIES, self.MODES[trigger], strict=True):
             self.camera.set_attribute_value(name, value, error_on_missing=False)
         rising = self.settings.trigger_edge == "rising"
@@ -106,11 +106,11 @@ class Dcam(Connection):
         return float(camera.get_attribute_value(target))
 
     def stamps(self, info: Any) -> tuple[int | None, float]:
-        """Frame stamp; and time stamp, which is 0 from cameras without it."""
+        """Frame stamp and time stamp, which is 0 from cameras without it."""
         return info.framestamp, info.timestamp_us * 1e-6 if info.timestamp_us > 0 else math.nan
 
     def details(self) -> Mapping[str, Any]:
-        """CONVERSION FACTOR: how many electrons a count is, and the counts of no electrons."""
+        """CONVERSION FACTOR, which is the electrons per count and the counts of no electrons."""
         names = {
             "electrons_per_count": "CONVERSION FACTOR COEFF",
             "offset_counts": "CONVERSION FACTOR OFFSET",
@@ -119,13 +119,13 @@ class Dcam(Connection):
         return {key: value(name) for key, name in names.items()}
 
     def _values(self, name: str) -> Sequence[int]:
-        """Values that a property can have; its first alone for a camera without the property."""
+        """Values that a property can have, the first alone for a camera without the property."""
         attribute = self.camera.get_attribute(name, error_on_missing=False)
         return (1,) if attribute is None else attribute.ivalues
 
 
 class Sdk3(Connection):
-    """Andor's SDK3: Zyla, Neo, Sona, Marana; features by the names of its manual."""
+    """Andor's SDK3 (Zyla, Neo, Sona, Marana), with features by the names of its manual."""
 
     vendor: ClassVar[Vendor] = SDK3
     MODES: ClassVar[Mapping[Trigger, tuple[str, str]]] = {
@@ -138,7 +138,7 @@ class Sdk3(Connection):
     """labseq's trigger -> pylablib's name and the SDK's."""
 
     def places(self) -> Sequence[Any]:
-        """Numbers of the cameras; the last two that the SDK reports are its simulated ones."""
+        """Numbers of the cameras. The last two that the SDK reports are its simulated ones."""
         return range(self.module.get_cameras_number())
 
     def identity(self) -> tuple[str, str, str]:
@@ -180,13 +180,13 @@ class Sdk3(Connection):
         return float(self.camera.set_temperature(celsius))
 
     def stamps(self, info: Any) -> tuple[int | None, float]:
-        """The time stamp; frames have no number."""
+        """The time stamp. Frames have no number."""
         ticks_per_s = self.camera.get_attribute_value("TimestampClockFrequency")
         return None, info.timestamp_dev / ticks_per_s if info.timestamp_dev > 0 else math.nan
 
 
 class Picam(Connection):
-    """PICam of Princeton Instruments: ProEM, PIXIS, Blaze; parameters by pylablib's names of them."""
+    """PICam of Princeton Instruments (ProEM, PIXIS, Blaze), with parameters by pylablib's names."""
 
     vendor: ClassVar[Vendor] = PICAM
     has_falling_edge: ClassVar[bool] = True
@@ -232,19 +232,19 @@ class Picam(Connection):
         return float(self.camera.get_attribute_value("Sensor Temperature Reading"))
 
     def cool(self, celsius: float) -> float | None:
-        """Sensor Temperature Set Point; the cooler is always on."""
+        """Sensor Temperature Set Point. The cooler is always on."""
         self.camera.set_attribute_value("Sensor Temperature Set Point", celsius)
         return float(self.camera.get_attribute_value("Sensor Temperature Set Point"))
 
     def stamps(self, info: Any) -> tuple[int | None, float]:
-        """Number and start of the exposure; None from cameras without them."""
+        """Number and start of the exposure, None from cameras without them."""
         stamp, ticks = getattr(info, "framestamp", None), getattr(info, "timestamp_start", None)
         ticks_per_s = self.camera.get_attribute_value("Time Stamp Resolution", error_on_missing=False)
         return stamp, ticks / ticks_per_s if ticks and ticks_per_s else math.nan
 
 
 class Pvcam(Connection):
-    """PVCAM of Teledyne Photometrics: Prime, Kinetix, Evolve."""
+    """PVCAM of Teledyne Photometrics (Prime, Kinetix, Evolve)."""
 
     vendor: ClassVar[Vendor] = PVCAM
     MODES: ClassVar[Mapping[Trigger, str]] = {
@@ -305,13 +305,13 @@ class Pvcam(Connection):
         return self.camera.set_temperature(celsius)
 
     def stamps(self, info: Any) -> tuple[int | None, float]:
-        """Number and start of the exposure; None from cameras without metadata."""
+        """Number and start of the exposure, None from cameras without metadata."""
         stamp, start_ns = getattr(info, "framestamp", None), getattr(info, "timestamp_start_ns", None)
         return stamp, math.nan if start_ns is None else start_ns * 1e-9
 
 
 class Pco(Connection):
-    """pco.sdk: edge, panda, dimax. pylablib opens the first camera only."""
+    """pco.sdk (edge, panda, dimax). pylablib opens the first camera only."""
 
     vendor: ClassVar[Vendor] = PCO
     MODES: ClassVar[Mapping[Trigger, str]] = {
@@ -338,7 +338,7 @@ class Pco(Connection):
         return float(period_s - exposure_s)
 
     def triggers(self) -> tuple[Trigger, ...]:
-        """Those of every PCO camera."""
+        """Triggers of every PCO camera."""
         return tuple(self.MODES)
 
     def set_trigger(self, trigger: Trigger) -> None:
@@ -356,7 +356,7 @@ class Pco(Connection):
         return float(self.camera.get_temperature()[0])
 
     def cool(self, celsius: float) -> float | None:
-        """Nothing: pylablib does not set it, which the settings refuse before."""
+        """Do nothing, since pylablib does not set it and the settings refuse it."""
         del celsius
 
     def details(self) -> Mapping[str, Any]:

@@ -29,8 +29,8 @@ class Vendor:
         module: pylablib's module, below ``pylablib.devices``.
         camera: Its class of cameras.
         windows: Name of the library under Windows.
-        linux: Name under Linux; "" where pylablib cannot use it.
-        source: What installs it.
+        linux: Name under Linux, "" where pylablib cannot use it.
+        source: Package that installs it.
         program: Program of the vendor that must be closed.
     """
 
@@ -83,8 +83,8 @@ def load(name: str, vendor: Vendor, path: str) -> Any:
 
     Args:
         name: Name of the camera in the profile, for errors.
-        vendor: Whose cameras.
-        path: The file; empty: where the vendor's installer puts it.
+        vendor: Vendor of the cameras.
+        path: The file, empty for where the vendor's installer puts it.
     """
     if sys.platform != "win32" and not vendor.linux:
         raise DeviceError(name, f"pylablib drives these cameras ({vendor.camera}) under Windows only")
@@ -112,11 +112,12 @@ def _loaded(vendor: Vendor, path: str) -> Any:
 def module_for(vendor: Vendor, library: Any = None) -> Any:
     """A copy of pylablib's module for a vendor's cameras that calls a library of its own.
 
-    pylablib keeps one library for each vendor. With a copy, a simulated camera can stand beside a real one.
+    pylablib keeps one library for each vendor. With a copy, a simulated and a real camera can be open at
+    once.
 
     Args:
-        vendor: Whose cameras.
-        library: The library, loaded; None: pylablib looks for it.
+        vendor: Vendor of the cameras.
+        library: The library, loaded, None to let pylablib look for it.
     """
     with _loading, _without_its_warnings():
         spec = importlib.util.find_spec(f"pylablib.devices.{vendor.module}")

@@ -58,7 +58,7 @@ class PylablibSettings(CameraSettings):
     )
 
     def identities(self) -> tuple[str, ...]:
-        """What only one process can use of it."""
+        """Names of the camera, which only one process can use."""
         if self.camera == SIMULATED:
             return ()
         return (f"{self.interface} camera {self.serial or '(the only one)'}",)

@@ -26,7 +26,7 @@ class PylonCamera(StandardCamera):
         super().__init__(settings, context, connection_for(settings, context))
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
-        """Those of the package, pylon and the camera; no real camera was tried."""
+        """Versions of the package, pylon and the camera. No real camera was tried."""
         return {
             "package pypylon": (metadata.version("pypylon"), "26.9"),
             "pylon": (self.reported.get("pylon_version", ""), "12.4.2"),

@@ -1,4 +1,4 @@
-"""Cameras that pylon reaches: finding and opening one, and the acquisition of its frames."""
+"""Cameras that pylon reaches, how to find and open them, and the acquisition of their frames."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ READY_S: Final = 1.0
 NANOSECONDS_PER_S: Final = 1_000_000_000
 """Ticks per second of cameras that do not report their frequency."""
 BUFFER_BYTES: Final = 256 * 2**20
-"""Memory for frames that were not read yet; a series that needs more reuses its buffers."""
+"""Memory for frames that were not read yet. A series that needs more reuses its buffers."""
 GIGE: Final = "BaslerGigE"
 MAX_GIGE_FRAMES: Final = 65535
 """GigE cameras number their frames from 1, with 16 bits."""
@@ -56,7 +56,7 @@ class PylonConnection(Connection):
     """A camera that pylon reaches.
 
     Attributes:
-        camera: pylon's ``InstantCamera``; None unless it is open.
+        camera: pylon's ``InstantCamera``, None unless it is open.
         ready_s: How long the camera may take until it accepts a trigger, in seconds.
     """
 
@@ -70,7 +70,7 @@ class PylonConnection(Connection):
 
     def warm(self) -> None:
         """Import pylon, which takes seconds."""
-        with suppress(DeviceError):  # open() reports what is missing
+        with suppress(DeviceError):  # open() reports the missing package
             load_pypylon(self._name)
 
     def open(self) -> Nodes:
@@ -85,7 +85,7 @@ class PylonConnection(Connection):
         return PylonNodes(sdk, camera.GetNodeMap())
 
     def device(self, sdk: Sdk) -> Any:
-        """Find the camera; returns pylon's device."""
+        """Find the camera, and return pylon's device."""
         return find_camera(sdk, self._settings.camera)
 
     def identity(self) -> Mapping[str, Any]:
@@ -100,7 +100,7 @@ class PylonConnection(Connection):
 
     def set_packets(self, features: Features) -> Mapping[str, Any]:
         """Set size of the packets, and pause between them."""
-        settings, only_gige = self._settings, "only GigE cameras have packets: leave out `{}`"
+        settings, only_gige = self._settings, "only GigE cameras have packets; leave out `{}`"
         self._ticks_per_s = features.read(int, "GevTimestampTickFrequency") or NANOSECONDS_PER_S
         if settings.packet_size is not None:
             hint = only_gige.format("packet_size")
@@ -130,9 +130,9 @@ class PylonConnection(Connection):
         return self._opened().doing(what)
 
     def check_alive(self) -> None:
-        """Raise if the camera is gone: not every call of pylon fails then."""
+        """Raise if the camera is gone, since not every call of pylon fails then."""
         if self.camera.IsCameraDeviceRemoved():
-            raise DeviceError(self._name, "the camera is gone; check its cable and power")
+            raise DeviceError(self._name, "the camera no longer answers; check its cable and power")
 
     def _opened(self) -> Sdk:
         if self._sdk is None:
@@ -142,7 +142,7 @@ class PylonConnection(Connection):
     # the acquisition
 
     def start(self, series: Series, trigger: Trigger) -> None:  # noqa: ARG002 - the camera is set to it
-        """Queue the buffers and start; with the internal trigger the first exposure begins."""
+        """Queue the buffers and start. With the internal trigger the first exposure begins."""
         if self._is_gige and series.n_frames > MAX_GIGE_FRAMES:
             limit = f"{MAX_GIGE_FRAMES}, the highest frame number of GigE cameras"
             raise LimitError(f"{self._name}: number of frames", series.n_frames, limit)
@@ -166,7 +166,7 @@ class PylonConnection(Connection):
             can_tell = camera.CanWaitForFrameTriggerReady()
             if can_tell and wait_for(ready, self.ready_s, self._clock) is None:
                 text = f"not ready for a trigger within {format_quantity(self.ready_s, 'time')}"
-                hint = "leave more time between exposures than the camera needs to read one out"
+                hint = "leave more time between exposures than the camera needs to read a frame"
                 raise DeviceTimeoutError(self._name, f"{text}; {hint}", self.ready_s)
 
     def fire(self) -> None:
@@ -175,7 +175,7 @@ class PylonConnection(Connection):
             self.camera.ExecuteSoftwareTrigger()
 
     def poll(self, seconds: float) -> ExposureResult | None:
-        """Wait for the next buffer, for at most ``seconds``; None if none came."""
+        """Wait for the next buffer, for at most ``seconds``. None if none came."""
         with self.doing("read a frame"):
             handling = self._opened().pylon.TimeoutHandling_Return
             result = self.camera.RetrieveResult(_milliseconds(seconds), handling)
@@ -188,7 +188,7 @@ class PylonConnection(Connection):
                 result.Release()
 
     def stop(self) -> None:
-        """End the acquisition; frames that were not read are dropped."""
+        """End the acquisition. Unread frames are dropped."""
         with self.doing("stop"):
             self.camera.StopGrabbing()
 
@@ -205,7 +205,7 @@ class PylonConnection(Connection):
 
 
 def find_camera(sdk: Sdk, serial: str | None) -> Any:
-    """Find the camera with a serial number; None: the only one.
+    """Find the camera with a serial number, or for None the only one.
 
     Emulated cameras, which pylon lists if the environment variable ``PYLON_CAMEMU`` is set, must be named.
 

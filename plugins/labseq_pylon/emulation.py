@@ -1,9 +1,9 @@
-"""pylon's emulated camera as the simulator: it takes its pictures from files.
+"""pylon's emulated camera as the simulator, which takes its pictures from files.
 
 The emulated camera exposes on a software trigger, cuts the region out of a picture, converts its pixels to
 the pixel format, and sends a buffer that pylon receives as it does any camera's. It reads the n-th file of a
-folder when it takes the n-th frame of a series, and not before; so a file that is written before the trigger
-is what that exposure sees. A file that was read is not read again in the same series.
+folder when it takes the n-th frame of a series, and not before, so a file that is written before the trigger
+is the picture of that exposure. A file that was read is not read again in the same series.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class EmulatedConnection(SimulatedExposures, PylonConnection):
         self._n_shown = 0
 
     def device(self, sdk: Sdk) -> Any:
-        """Create an emulated camera; each driver gets its own."""
+        """Create an emulated camera. Each driver gets its own."""
         with sdk.doing("create an emulated camera"), listed():
             layer: Any = sdk.pylon.TlFactory.GetInstance().CreateTl(EMULATION)
             if layer is None or not (infos := layer.EnumerateDevices()):
@@ -73,8 +73,8 @@ class EmulatedConnection(SimulatedExposures, PylonConnection):
     def arm(self, series: Series, period_s: float) -> None:
         """Get ready for a series, before the camera is started.
 
-        The camera's own exposure is as long as that of the series; on a virtual clock it is as short as
-        possible. (Its node ``ExposureTime`` is checked and read back, but has no effect.)
+        The camera's own exposure is as long as the series', on a virtual clock as short as possible. (Its
+        node ``ExposureTime`` is checked and read back, but has no effect.)
         """
         assert self._nodes is not None
         nodes, self._n_shown = self._nodes, 0
@@ -96,7 +96,7 @@ class EmulatedConnection(SimulatedExposures, PylonConnection):
         self.fire()
 
     def poll(self, seconds: float) -> ExposureResult | None:
-        """Wait for the next buffer; the file that it came from is emptied."""
+        """Wait for the next buffer, and empty its file."""
         taken = super().poll(seconds)
         if taken is not None and taken.number < self._n_shown:
             self._path(taken.number).write_bytes(b"")
@@ -121,7 +121,7 @@ class EmulatedConnection(SimulatedExposures, PylonConnection):
         return self._folder / f"{number:06d}.tif"
 
     def _picture(self, image: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """A picture of the whole sensor with a frame in its region, in the upper bits; zeros elsewhere."""
+        """A picture of the sensor with a frame in its region, in the upper bits, and zeros elsewhere."""
         mode = self._settings.mode
         height, width = (size // mode.binning for size in self._shape)
         y, x = (start // mode.binning for start in (mode.region or (0, 0))[:2])

@@ -49,7 +49,7 @@ def simulated_settings() -> dict[str, str | None] | str:
 def load_pypylon(name: str) -> Sdk:
     """Import ``pypylon``.
 
-    Its types make Python warn when they are created; as of 26.9 the process dies if warnings are errors.
+    Its types make Python warn when they are created. As of 26.9 the process dies if warnings are errors.
     """
     try:
         with warnings.catch_warnings():
@@ -80,7 +80,7 @@ class PylonNodes:
         return node is not None and bool(self._sdk.genicam.IsAvailable(node))
 
     def options(self, feature: str) -> tuple[str, ...]:
-        """Values of an enumeration that can be chosen; none if the camera does not have it."""
+        """Values of an enumeration that can be chosen, none if the camera does not have it."""
         return tuple(self._map.GetNode(feature).Symbolics) if self.is_available(feature) else ()
 
     def get(self, feature: str, kind: type[Value]) -> Value:

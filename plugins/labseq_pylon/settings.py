@@ -17,5 +17,5 @@ class PylonSettings(StandardSettings):
     )
 
     def identities(self) -> tuple[str, ...]:
-        """What only one process can use of it."""
+        """Names of the camera, which only one process can use."""
         return () if self.camera == SIMULATED else (f"Basler camera {self.camera or '(the only one)'}",)

@@ -118,8 +118,8 @@ def load_spcm(name: str, library: Library) -> Any:
     except Exception as error:  # it raises a bare Exception without the library
         reason = (str(error).splitlines() or [type(error).__name__])[0].partition(". ")[0].rstrip(".")
         text = f"the Python package 'spcm_core' finds no driver library ({reason}); install Spectrum's driver"
-        hint = "to try things without a card, set `card: simulated`"
-        raise DeviceError(name, f"{text} for this system; {hint}") from error
+        hint = "To try things without a card, set `card: simulated`"
+        raise DeviceError(name, f"{text} for this system. {hint}") from error
 
 
 def _not_installed(name: str, error: ModuleNotFoundError) -> DeviceError:

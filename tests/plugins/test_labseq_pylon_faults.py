@@ -60,7 +60,7 @@ def test_an_unplugged_camera_is_an_error_and_can_be_opened_again() -> None:
     made.camera.read(1.0)
     made.camera.trigger()
     made.pylon.FirePnPCallback.Execute()
-    gone = "camera: the camera is gone; check its cable and power"
+    gone = "camera: the camera no longer answers; check its cable and power"
     made.camera.read(1.0)
     with pytest.raises(DeviceError, match=gone):
         made.camera.trigger()
