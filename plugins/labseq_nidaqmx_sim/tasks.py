@@ -224,9 +224,7 @@ class Computer:
         if not fastest_hz:
             raise Refused(Code.INVALID_VALUE, "sample clock (supported: on demand)")
         if not 0 < task.rate_hz <= fastest_hz:
-            raise Refused(
-                Code.INVALID_VALUE, f"rate {task.rate_hz:g} Hz (at most {fastest_hz:g} Hz)"
-            )
+            raise Refused(Code.INVALID_VALUE, f"rate {task.rate_hz:g} Hz (at most {fastest_hz:g} Hz)")
         if task.kind == "do" and not model.has_do_clock and not task.source:
             raise Refused(Code.NO_CLOCK_SOURCE)
 

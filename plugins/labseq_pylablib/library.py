@@ -112,8 +112,7 @@ def _loaded(vendor: Vendor, path: str) -> Any:
 def module_for(vendor: Vendor, library: Any = None) -> Any:
     """A copy of pylablib's module for a vendor's cameras that calls a library of its own.
 
-    pylablib keeps one library for each vendor. With a copy, a simulated and a real camera can be open at
-    once.
+    pylablib keeps one library for each vendor. With a copy, simulated and real cameras can be open together.
 
     Args:
         vendor: Vendor of the cameras.

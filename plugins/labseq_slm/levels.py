@@ -1,4 +1,4 @@
-"""From phases to the grey levels of an SLM: its look-up table, and the correction of its surface."""
+"""Conversion of phases to an SLM's grey levels by its look-up table, and correction of its surface."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from labseq.plugin.messages import install_hint
 
 LEVELS: Final = 256
 FINE: Final = 4096
-"""Steps of the phase for which the nearest grey level is looked up: 16 for each level."""
+"""Steps of the phase for which the nearest grey level is looked up, 16 for each level."""
 
 
 class BadFileError(Exception):
     """A file that cannot be used.
 
     Attributes:
-        problem: The file, what is wrong with it, and what was expected.
+        problem: The file with its fault, and what was expected.
     """
 
     def __init__(self, path: Path, what: str, expected: str) -> None:
@@ -31,7 +31,7 @@ class BadFileError(Exception):
 
 
 def read_look_up_table(path: Path | None) -> NDArray[np.float64]:
-    """Phase of each grey level, float64 (256,) in rad; without a file they rise linearly to 2 pi.
+    """Phase of each grey level, float64 (256,) in rad. Without a file they rise linearly to 2 pi.
 
     Raises:
         BadFileError: It is not such a file.
@@ -46,7 +46,7 @@ def read_look_up_table(path: Path | None) -> NDArray[np.float64]:
 
 
 def read_correction(path: Path | None, pixels: tuple[int, int]) -> NDArray[np.float32]:
-    """Phase that corrects the surface, float32 (rows, columns) in rad; 0 without a file.
+    """Phase that corrects the surface, float32 (rows, columns) in rad, 0 without a file.
 
     Raises:
         BadFileError: It is not such a file.
@@ -67,7 +67,7 @@ def _array(path: Path, expected: str) -> Any:
         with opened_array(path) as array:
             return np.array(array)
     except (ConfigError, KeyError) as error:
-        raise BadFileError(path, "it is not a file of an array", expected) from error
+        raise BadFileError(path, "it is not a file with an array", expected) from error
 
 
 def _picture(path: Path, expected: str) -> Any:

@@ -1,4 +1,4 @@
-"""The optics between SLM and atoms: where the sites are in the far field, the beam, and aberrations.
+"""The optics between SLM and atoms, with the sites in the far field, the beam, and aberrations.
 
 A phase that grows by k radians from pixel to pixel sends the light to ``k * wavelength * focal_length /
 (2 pi * pixel_pitch)`` from the zeroth order (Goodman, "Introduction to Fourier Optics", chapter 5). Pixels
@@ -27,11 +27,11 @@ At this distance the light of a spot is down to 4e-6 of its middle."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Optics:
-    """Where light has to go, and the light that there is.
+    """Directions of the light to the sites, and the available light.
 
     Attributes:
         row_rad: float64 (n_sites,), phase from row to row of pixels that sends light to a site.
-        column_rad: float64 (n_sites,), likewise from column to column.
+        column_rad: float64 (n_sites,), the same phase from column to column.
         pixels: Rows and columns of pixels.
         beam_px: 1/e^2 radius of the intensity on the SLM, in pixels.
     """
@@ -117,8 +117,8 @@ def beam(pixels: tuple[int, int], waist_px: float, shift_px: float = 0.0) -> NDA
 def zernike_phase(modes: ZernikeSettings, pixels: tuple[int, int]) -> NDArray[np.float32]:
     """The sum of Zernike modes, float32 (rows, columns) in rad.
 
-    The modes have the norm of Noll (J. Opt. Soc. Am. 66, 207, 1976): coefficients are r.m.s. phases over the
-    largest circle on the pixels. Beyond the circle the polynomials go on.
+    The modes have the norm of Noll (J. Opt. Soc. Am. 66, 207, 1976), so coefficients are r.m.s. phases over
+    the largest circle on the pixels. Beyond the circle the polynomials go on.
     """
     radius = (min(pixels) - 1) / 2
     row, column = (((np.arange(n) - (n - 1) / 2) / radius).astype(np.float32) for n in pixels)

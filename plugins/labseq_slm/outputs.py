@@ -1,4 +1,4 @@
-"""Where grey levels go: a display, through ``slmsuite``, a file, or the simulated SLM."""
+"""Outputs of grey levels to a display, through ``slmsuite``, a file, or the simulated SLM."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ class Output(Protocol):
     """An SLM that can be written to."""
 
     def open(self) -> None:
-        """Get ready; nothing is shown."""
+        """Get ready, without showing anything."""
         ...
 
     def show(self, levels: Levels) -> None:
-        """Show grey levels, uint8 (rows, columns); returns when they were handed over."""
+        """Show grey levels, uint8 (rows, columns), and return when they were handed over."""
         ...
 
     def close(self) -> None:
-        """Disconnect; legal in any state."""
+        """Disconnect. Legal in any state."""
         ...
 
     def versions(self) -> dict[str, tuple[str, str]]:
@@ -81,7 +81,7 @@ class Display:
             raise DeviceError(self._name, f"{text}; choose another `display`, or set its resolution")
 
     def show(self, levels: Levels) -> None:
-        """Show grey levels; integers are displayed as they are."""
+        """Show grey levels. Integers are displayed as they are."""
         try:
             self._screen.set_phase(levels, phase_correct=False, settle=False, block=True)
         except Exception as error:  # see open()
@@ -95,7 +95,7 @@ class Display:
             screen.close()
 
     def versions(self) -> dict[str, tuple[str, str]]:
-        """The version of slmsuite; no real SLM was tried."""
+        """The version of slmsuite. No real SLM was tried."""
         return {"slmsuite": (self._version, "0.5.0")} if self._version else {}
 
 
@@ -104,7 +104,7 @@ class PngFile:
 
     Args:
         name: Name of the device.
-        path: The file; it is replaced at once, so that the other program never reads half of one.
+        path: The file, which is replaced at once, so that the other program never reads half of it.
     """
 
     def __init__(self, name: str, path: Path) -> None:
@@ -137,7 +137,7 @@ class PngFile:
             raise DeviceError(self._name, f"cannot write {self._path}: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """Do nothing: the file stays."""
+        """Do nothing, since the file stays."""
 
     def versions(self) -> dict[str, tuple[str, str]]:
         """None."""

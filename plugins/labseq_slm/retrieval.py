@@ -1,15 +1,15 @@
-"""Phase retrieval: which light on the pixels makes spots of given powers at the sites.
+"""Phase retrieval, which finds the light on the pixels that makes spots of given powers at the sites.
 
 Weighted Gerchberg-Saxton iterations (Di Leonardo, Ianni, Ruocco, Opt. Express 15, 1913, 2007), in two parts.
 First the phases of the spots are found, with equal weights. Then they are kept, and only the amplitudes of
 the spots are adapted to the weights (Kim et al., Opt. Lett. 44, 3178, 2019), so that the pattern changes
 little with the weights and a calibration of the weights remains valid.
 
-The far field is summed over all pixels exactly at each site, as two products of matrices, instead of by a
-fast Fourier transform, whose grid of frequencies the sites are not on. Most iterations use only each fourth
-pixel of rows and columns (as Pozzi et al., Opt. Express 26, 32176, 2018, who draw them at random). The module
-does not use the retrieval of ``slmsuite``, because that is made for graphics cards and its fast method rounds
-sites to the grid of the transform.
+The far field is summed over all pixels exactly at each site, as two products of matrices, because the sites
+are not on the grid of frequencies of a fast Fourier transform. Most iterations use only each fourth pixel of
+rows and columns (as Pozzi et al., Opt. Express 26, 32176, 2018, who draw them at random). The module does not
+use the retrieval of ``slmsuite``, because that is made for graphics cards and its fast method rounds sites to
+the grid of the transform.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from labseq.plugin.system import cache_root
 from labseq_slm.optics import Optics, beam
 
 Coefficients = NDArray[np.complex64]
-"""complex64 (n_sites,): amplitude and phase of the wave to each site."""
+"""complex64 (n_sites,), amplitude and phase of the wave to each site."""
 
 SEARCH: Final = 25
 """Iterations that find the phases of the spots (ours)."""
 ADAPT: Final = 10
-"""Iterations that adapt the amplitudes on few pixels: 400 sites then differ by 0.3 % there, measured."""
+"""Iterations that adapt the amplitudes on few pixels. 400 sites then differ by 0.3 % there, measured."""
 FINISH: Final = 3
-"""Iterations on all pixels: the spread there was 1.1 % in the first, and 0.2 % in the third."""
+"""Iterations on all pixels. The spread there was 1.1 % in the first, and 0.2 % in the third."""
 
 
 class FarField:
@@ -43,7 +43,7 @@ class FarField:
 
     Args:
         optics: Where the sites are.
-        amplitude: float32 (rows, columns), that of the light on the pixels.
+        amplitude: float32 (rows, columns), amplitude of the light on the pixels.
         step: 4 takes each fourth pixel of rows and columns.
     """
 
@@ -60,7 +60,7 @@ class FarField:
         return np.matmul((self._rows * coefficients[:, None]).T, self._columns, dtype=np.complex64)
 
     def at_sites(self, phasors: NDArray[np.complex64]) -> Coefficients:
-        """Amplitude at each site, complex64 (n_sites,), of a phase pattern; 1 if all light went there.
+        """Amplitude at each site, complex64 (n_sites,), of a phase pattern, 1 if all light went there.
 
         Args:
             phasors: complex64 (rows, columns) of modulus 1.
@@ -74,7 +74,7 @@ class FarField:
 
 
 def phasors_of(light: NDArray[np.complexfloating]) -> NDArray[np.complex64]:
-    """Waves of the same phases and modulus 1; 0 where there is no light."""
+    """Waves of the same phases and modulus 1, 0 where there is no light."""
     modulus = np.maximum(np.abs(light), np.float32(1e-12))
     return (light / modulus).astype(np.complex64, copy=False)
 
@@ -84,7 +84,7 @@ def _waves(rad: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.
 
 
 def retrieve(optics: Optics, weights: NDArray[np.float64]) -> Coefficients:
-    """The waves whose sum has the phases to display; taken from the cache if they were found before.
+    """The waves whose sum has the phases to display, from the cache if they were found before.
 
     Args:
         optics: Where the sites are, and the beam.
@@ -126,7 +126,7 @@ def _iterated(
 
 
 def _step(optics: Optics) -> int:
-    """The coarsest step between pixels that is enough: orders of the coarse grid must not overlap."""
+    """The coarsest sufficient step between pixels, at which orders of the coarse grid do not overlap."""
     widths = np.ptp(optics.row_rad), np.ptp(optics.column_rad)
     n_enough = 40 * len(optics.row_rad)  # pixels for each site
     steps = [

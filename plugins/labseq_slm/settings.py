@@ -13,7 +13,7 @@ PixelCount: TypeAlias = Annotated[int, Field(ge=64, le=4320)]
 
 
 class ZernikeSettings(Settings):
-    """Phases that correct aberrations: r.m.s. of each Zernike mode over the circle within the pixels."""
+    """Phases that correct aberrations, as r.m.s. of each Zernike mode over the circle within the pixels."""
 
     defocus: Angle = Field(default=0.0, description="term Z(2, 0)")
     oblique_astigmatism: Angle = Field(default=0.0, description="term Z(2, -2), axes at 45 degrees")
@@ -26,10 +26,10 @@ class ZernikeSettings(Settings):
 
 
 class SimulatedErrors(Settings):
-    """What the simulated SLM does not know of the real one, and the driver has to live with (ours)."""
+    """Errors of the simulated SLM that its driver does not know (ours)."""
 
     phase_range: Fraction = Field(
-        default=0.08, description="by how much the largest phase exceeds that of the look-up table"
+        default=0.08, description="by how much the largest phase exceeds the look-up table's"
     )
     phase_curve: Angle = Field(
         default=0.25, description="amplitude of a further error of the phase, one period over all levels"
@@ -98,7 +98,7 @@ class SlmSettings(Settings):
         return self.output == "simulated"
 
     def identities(self) -> tuple[str, ...]:
-        """What only one process can use of it."""
+        """Names of the SLM, which only one process can use."""
         places = {"display": f"display {self.display}", "file": f"image {self.image}"}
         return (places[self.output],) if self.output in places else ()
 

@@ -23,7 +23,7 @@ class SlmStaticTweezers(StaticTweezers):
     """Shows the phases that send the light to the sites, each with its weight.
 
     An SLM distributes the light and cannot switch it. While the array is off it shows random phases,
-    which spread the light over the whole field: neither the sites nor the zeroth order are bright.
+    which spread the light over the whole field, so neither the sites nor the zeroth order are bright.
 
     Args:
         settings: The SLM, its optics and corrections.
@@ -41,13 +41,13 @@ class SlmStaticTweezers(StaticTweezers):
         self._weights: Floats | None = None
         self._output = choose_output(self._name, settings, self._optics, context)
         self._depth = 0.0
-        self._nearest: NDArray[np.uint8] | None = None  # None: not open
+        self._nearest: NDArray[np.uint8] | None = None  # None while not open
         self._added = np.zeros(0, np.float32)
         self._efficiency = 0.0
 
     @property
     def facts(self) -> TweezersFacts:
-        """Each site has a weight; the light cannot be ramped."""
+        """Each site has a weight. The light cannot be ramped."""
         return TweezersFacts(control="sites", ramps=False)
 
     def check_settings(self) -> Mapping[str, Problem]:
@@ -69,7 +69,7 @@ class SlmStaticTweezers(StaticTweezers):
         retrieve(self._optics, self._calibrated.ravel())
 
     def open(self) -> None:
-        """Read the files and show random phases; no effect if it is open.
+        """Read the files and show random phases. No effect if it is open.
 
         Raises:
             DeviceError: A file is wrong, or the output cannot be opened.
@@ -88,7 +88,7 @@ class SlmStaticTweezers(StaticTweezers):
         self._darken()
 
     def close(self) -> None:
-        """Show random phases and disconnect; legal in any state."""
+        """Show random phases and disconnect. Legal in any state."""
         try:
             self.safe_state()
         finally:
@@ -96,7 +96,7 @@ class SlmStaticTweezers(StaticTweezers):
             self._output.close()
 
     def safe_state(self) -> None:
-        """Show random phases; no effect if it does."""
+        """Show random phases. No effect if it does already."""
         if self._nearest is not None and self._depth:
             self._darken()
 
@@ -123,7 +123,7 @@ class SlmStaticTweezers(StaticTweezers):
         self._load(weights / weights.mean())
 
     def start(self) -> None:
-        """Show the array; no effect if it is shown."""
+        """Show the array. No effect if it is shown."""
         self._opened()
         if self._depth != 1.0:
             self._show_array()
@@ -142,7 +142,7 @@ class SlmStaticTweezers(StaticTweezers):
         self.start() if depth else self.safe_state()
 
     def self_test(self) -> None:
-        """Check that the SLM takes grey levels; it shows random phases again.
+        """Check that the SLM takes grey levels. It shows random phases again.
 
         Raises:
             DeviceError: It is not open, or does not take them.
@@ -151,7 +151,7 @@ class SlmStaticTweezers(StaticTweezers):
         self._darken()
 
     def versions(self) -> Mapping[str, tuple[str, str]]:
-        """Those of the packages that the output uses."""
+        """Versions of the packages that the output uses."""
         return self._output.versions()
 
     def describe(self) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""A simulated SLM for ``labseq_slm``: from the grey levels that it is sent to the light at the sites."""
+"""A simulated SLM for ``labseq_slm``, from its grey levels to the light at the sites."""
 
 from labseq_slm_sim.panel import SimulatedSlm
 

@@ -1,4 +1,4 @@
-"""The simulated SLM and its optics, which differ from what the driver believes of them."""
+"""The simulated SLM and its optics, which differ from the driver's settings."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from labseq.plugin import Context, DeviceError, TweezerAmplitudes
 from labseq.plugin.simulation import ReceivesOutput
 
 RESPONSE_S: Final = 8e-3
-"""Time constant with which the phase of a liquid crystal follows (ours; makers say 5 to 30 ms)."""
+"""Time constant with which the phase of a liquid crystal follows (ours, makers say 5 to 30 ms)."""
 FOLLOWED: Final = 7.0
 """Time constants after which the phase counts as reached."""
 NOMINAL: Final = 0.75
 """Part of the light in the sites together, with which they have their nominal depth (ours)."""
 DECIMALS: Final = 4
-"""Decimals of the powers: far above the rounding of float32, far below what matters to an atom."""
+"""Decimals of the powers, coarser than the rounding of float32 and too fine to matter to an atom."""
 
 Levels = NDArray[np.uint8]
 
@@ -36,7 +36,7 @@ class SimulatedSlm:
 
     Args:
         name: Name of the device.
-        settings: What the driver believes, and the errors.
+        settings: Settings of the driver, with the errors.
         optics: Where the sites are.
         context: Grid, clock, and the simulation, which receives the powers if it implements
             ``ReceivesOutput``.
@@ -52,7 +52,7 @@ class SimulatedSlm:
         self._is_new = False
 
     def open(self) -> None:
-        """Connect to the simulation; the panel is at grey level 0."""
+        """Connect to the simulation. The panel is at grey level 0."""
         errors, pixels = self._settings.errors, self._settings.pixels
         shift_px = errors.beam_shift / self._settings.pixel_pitch
         light = beam(pixels, self._optics.beam_px * (1 + errors.beam_waist), shift_px)
@@ -64,7 +64,7 @@ class SimulatedSlm:
             self._simulation.connect_outputs("static_tweezers", self)
 
     def close(self) -> None:
-        """Disconnect; the panel keeps what it shows."""
+        """Disconnect. The panel keeps its picture."""
         self._field = None
 
     def show(self, levels: Levels) -> None:
@@ -77,7 +77,7 @@ class SimulatedSlm:
         if self._field is None:
             raise DeviceError(self._name, "the simulated SLM is not open")
         if levels.shape != pixels or levels.dtype != np.uint8:
-            text = f"the simulated SLM got {levels.dtype} of shape {levels.shape}; expected uint8 of {pixels}"
+            text = f"the simulated SLM got {levels.dtype} of shape {levels.shape}, not uint8 of {pixels}"
             raise DeviceError(self._name, text)
         self._before = self._phase_at(self._clock.now())
         errors, x = self._settings.errors, np.arange(256) / 256

@@ -45,11 +45,11 @@ CODES: Final[Mapping[int, str]] = {
 }
 """Codes that end a stream, and their names."""
 PAUSE_S: Final = 1e-3
-"""Between two looks at a state that another process may change."""
+"""Time between two looks at a state that another process may change."""
 
 
 class Clock(Protocol):
-    """What a radio needs of a clock; labseq's clocks have it."""
+    """Methods of a clock that a radio needs, which labseq's clocks have."""
 
     def now(self) -> float:
         """Time in seconds."""
@@ -76,12 +76,12 @@ class SimulatedDevice:
     """One radio that is open.
 
     Args:
-        arguments: ``driver=capture``, with those of ``device: simulated,...``; the package's README
-            describes them.
-        clock: Clock by which it plays; by default the computer's.
+        arguments: ``driver=capture``, with arguments of ``device: simulated,...``, which the package's README
+            describes.
+        clock: Clock by which it plays, by default the computer's.
 
     Raises:
-        SoapyError: It is lost, or another process has it open. Methods raise this for what they refuse.
+        SoapyError: It is lost, or another process has it open. Methods raise this for refused values.
     """
 
     def __init__(self, arguments: str, clock: Clock | None = None) -> None:
@@ -100,7 +100,7 @@ class SimulatedDevice:
         try:
             self._resources.enter_context(radio_lock(self._folder).acquire(timeout=0.1))
         except Timeout:
-            raise SoapyError("the device is busy: another program has opened it") from None
+            raise SoapyError("the device is busy, since another program has opened it") from None
         self._header, self._ring = create(self._folder)
         for name in ("speed", "patience", "leakage"):
             self._header["patience_s" if name == "patience" else name] = self._number[name]
@@ -117,9 +117,9 @@ class SimulatedDevice:
         self._trace("open")
 
     def close(self) -> None:
-        """Switch the transmitters off; another process may open the radio then."""
+        """Switch the transmitters off. Another process may open the radio then."""
         if self._channels:
-            raise SoapyError("the radio was closed before its stream: this would end a real program")
+            raise SoapyError("the radio was closed before its stream, which would end a real program")
         self._header["is_active"] = 0
         self._trace("close")
         self._resources.close()
@@ -139,7 +139,7 @@ class SimulatedDevice:
             raise SoapyError(f"there is no clock source {source}")
 
     def set(self, what: str, channel: int, value: float | str) -> None:
-        """Set "Antenna", "SampleRate" or "Gain" of a channel, as near as the radio can; it has no filters."""
+        """Set "Antenna", "SampleRate" or "Gain" of a channel, as near as the radio can. It has no filters."""
         self._check_channel(channel)
         if what == "Antenna" and value not in ANTENNAS:
             raise SoapyError(f"there is no antenna {value}")
@@ -164,7 +164,7 @@ class SimulatedDevice:
         return GAINS_DB[:2]
 
     def set_frequency(self, channel: int, frequency_hz: float, offset_hz: float) -> None:
-        """Tune RF to a frequency plus an offset, and BB to what is left, each as near as the radio can."""
+        """Tune RF to a frequency plus an offset, and BB to the rest, each as near as the radio can."""
         self._check_channel(channel)
         (low_hz, high_hz), (least_hz, most_hz) = COMPONENTS_HZ["RF"], COMPONENTS_HZ["BB"]
         tuned_hz = min(max(frequency_hz + offset_hz + self._number["detune"], low_hz), high_hz)
@@ -220,7 +220,7 @@ class SimulatedDevice:
         self._channels = ()
 
     def activate(self) -> int:
-        """Switch the transmitters on; returns a code of SoapySDR."""
+        """Switch the transmitters on, and return a code of SoapySDR."""
         if self._fault == "inactive":
             return STREAM_ERROR
         self._header["sent"] = 0
@@ -229,15 +229,15 @@ class SimulatedDevice:
         return 0
 
     def deactivate(self) -> int:
-        """Switch the transmitters off; returns a code of SoapySDR."""
+        """Switch the transmitters off, and return a code of SoapySDR."""
         if self._has(Fault.GONE):
-            raise SoapyError("the radio does not answer: was it unplugged?")
+            raise SoapyError("the radio does not answer; was it unplugged?")
         self._header["is_active"] = 0
         self._trace("stop")
         return 0
 
     def write(self, samples: Samples, start: int, start_ns: int | None, timeout_s: float) -> int:
-        """Take samples, after ``timeout_s`` at most; returns how many, or a code of SoapySDR."""
+        """Take samples, after ``timeout_s`` at most. Returns how many, or a code of SoapySDR."""
         while self._has(Fault.HANG):
             self._clock.sleep(0.1)
         if not self._header["is_active"] or self._has(Fault.STREAM_ERROR | Fault.GONE):
@@ -295,7 +295,7 @@ class SimulatedDevice:
         return float(self._header["rate_hz"]) * self._number["speed"]
 
     def _start(self, start_ns: int | None) -> None:
-        """The channels start together at a time that is not over; otherwise each with its first packet."""
+        """Start the channels together at a time that is not over, otherwise each with its first packet."""
         now_s, header = self._clock.now(), self._header
         start_s = None if start_ns is None else self._zero_s + 1e-9 * start_ns
         if start_s is not None and start_s <= now_s + self._number["delay"]:
@@ -306,7 +306,7 @@ class SimulatedDevice:
         self._trace("play", header["t0_s"], self._speed_hz)
 
     def _drops(self, fault: Fault, count: str) -> bool:
-        """Whether a packet is lost: what follows is played earlier, and the phases of all tones jump."""
+        """Whether a packet is lost. Later samples then play earlier, and the phases of all tones jump."""
         if not self._has(fault):
             return False
         self._clear(fault)
@@ -317,7 +317,7 @@ class SimulatedDevice:
         self._header["fault"] = int(self._header["fault"]) & ~int(fault)
 
     def _late_s(self) -> float:
-        """How long its buffer has been empty; negative: how long its samples will last."""
+        """How long its buffer has been empty. If negative, how long its samples will last."""
         return self._clock.now() - float(self._header["t0_s"]) - int(self._header["sent"]) / self._speed_hz
 
     def _notice_underflow(self) -> None:
@@ -331,7 +331,7 @@ class SimulatedDevice:
             self._clear(Fault.UNDERFLOW)
 
     def _buffered(self) -> float:
-        """Samples in its buffer; an underflow, or a wait for late samples, sets its clock back."""
+        """Samples in its buffer. An underflow, or a wait for late samples, sets its clock back."""
         header, sent = self._header, int(self._header["sent"])
         self._notice_underflow()
         late_s = self._late_s()
@@ -342,7 +342,7 @@ class SimulatedDevice:
         return min(sent, -late_s * self._speed_hz)
 
     def _wait_for_room(self, n: int, timeout_s: float) -> int:
-        """How many of n samples the buffer takes; waits for all of them as long as it may."""
+        """How many of n samples the buffer takes. Waits for all of them as long as it may."""
         deadline_s = self._clock.now() + timeout_s
         while True:
             is_stalled = self._has(Fault.STALL)
@@ -397,9 +397,9 @@ NUMBERS: Final[Mapping[str, tuple[float, float]]] = {
     "delay": (0.0, 0.0),
     "detune": (0.0, -1e9),
 }
-"""Arguments that are numbers -> what they are where they are not given, and their lowest values.
+"""Arguments that are numbers -> their defaults, and their lowest values.
 
-A tenth of real time costs a tenth of the work. On a busy computer samples sometimes come late: the radio's
+A tenth of real time costs a tenth of the work. On a busy computer samples sometimes come late. The radio's
 clock then waits for them, so that equal runs give equal atoms.
 """
 

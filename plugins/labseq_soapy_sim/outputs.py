@@ -12,7 +12,7 @@ from labseq.plugin import TweezerAmplitudes
 from labseq_soapy_sim.ring import Ring
 
 DECIMALS: Final = 6
-"""Decimals of the amplitudes: far above the rounding of float32, far below what matters to an atom."""
+"""Decimals of the amplitudes, coarser than the rounding of float32 and too fine to matter to an atom."""
 
 Floats = NDArray[np.float64]
 
@@ -21,8 +21,8 @@ class CapturedOutputs:
     """The two connectors of a simulated radio.
 
     Implements ``labseq.plugin.simulation.ToneSource``. Amplitudes are measured at the frequencies where the
-    tones should be: a signal at another frequency, because the local oscillator or the sample rate is wrong,
-    makes no tweezers; nor does the leakage of the oscillator, unless it is on a tone.
+    tones should be. A signal at another frequency, because the local oscillator or the sample rate is wrong,
+    makes no tweezers. Nor does the leakage of the oscillator, unless it is on a tone.
 
     Args:
         ring: The samples that the radio received.
@@ -39,7 +39,7 @@ class CapturedOutputs:
         self._filters: dict[tuple[int, float, float, float], NDArray[np.complex128]] = {}
 
     def measure(self) -> None:
-        """Record the amplitudes if they have changed; an underflow is recorded as darkness in between."""
+        """Record the amplitudes if they have changed. An underflow is recorded as darkness in between."""
         underflows = int(self._ring["underflows"])
         if underflows != self._underflows:
             self._underflows = underflows
@@ -51,7 +51,7 @@ class CapturedOutputs:
         self._record(self._now(), float(self._ring["silence"]) / float(self._ring["rate_hz"]))
 
     def played(self, until_s: float) -> Sequence[TweezerAmplitudes]:  # noqa: ARG002 - all changes are in the past
-        """The amplitudes since the last call, in time's order; empty if unchanged."""
+        """The amplitudes since the last call, in time's order, empty if unchanged."""
         self.measure()
         changes, self._changes = self._changes, []
         return changes

@@ -1,4 +1,4 @@
-"""``device: simulated``: the driver streams to a radio that exists only in software."""
+"""The radio of ``device: simulated``, which exists only in software."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WORDS: Final[Mapping[str, tuple[str, ...]]] = {
     "folder": (),
     "unlocked": ("ref", "lo"),
 }
-"""Arguments that are texts, and their allowed values; none: any."""
+"""Arguments that are texts, and their allowed values, empty for any."""
 STREAMER: Final = "labseq_soapy_sim.streamer"
 """The streaming process, with the simulated library."""
 
@@ -33,7 +33,7 @@ def read_arguments(device: str) -> dict[str, str]:
     """The arguments of a device such as ``simulated,speed=1,buffer=0.05``.
 
     Raises:
-        SettingError: There is no such argument, or it is out of range; at the key ``device``.
+        SettingError: There is no such argument, or it is out of range, at the key ``device``.
     """
     pairs = (pair.partition("=") for pair in device.split(",")[1:])
     arguments = {key.strip(): value.strip() for key, _, value in pairs}
@@ -64,7 +64,7 @@ def _check_argument(key: str, value: str) -> None:
 
 
 class SimulatedRadio:
-    """One simulated radio and its files; the driver opens it instead of a real one.
+    """One simulated radio and its files, which the driver opens instead of a real one.
 
     Args:
         device: ``simulated``, with arguments of the radio after a comma.
@@ -85,13 +85,13 @@ class SimulatedRadio:
 
     @property
     def ring(self) -> Ring:
-        """The samples that it received; it must be open."""
+        """The samples that it received. It must be open."""
         assert self.folder is not None
         return Ring(self.folder)
 
     @property
     def outlives_run(self) -> bool:
-        """Whether it can stay on when labseq has ended: only if its files are in a folder that stays."""
+        """Whether it can stay on when labseq has ended, because its files are in a folder that stays."""
         return self._given
 
     def connect(self) -> tuple[str, str, Path]:
@@ -105,23 +105,23 @@ class SimulatedRadio:
         return ",".join(f"{key}={value}" for key, value in arguments.items()), STREAMER, self.folder
 
     def started(self, tones_hz: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
-        """The radio streams: let the simulation receive these tones of rows and columns from now on."""
+        """Let the simulation receive these tones of rows and columns from now on, as the radio streams."""
         if isinstance(self._simulation, ReceivesOutput):
             self._outputs = CapturedOutputs(self.ring, tones_hz, self._channels)
             self._simulation.connect_outputs("static_tweezers", self._outputs)
 
     def changed(self) -> None:
-        """The driver has changed the amplitudes: measure them."""
+        """Measure the amplitudes after the driver has changed them."""
         if self._outputs is not None:
             self._outputs.measure()
 
     def released(self) -> None:
-        """The driver has released the atoms: the silence in the samples is over."""
+        """End the silence in the samples after the driver has released the atoms."""
         if self._outputs is not None:
             self._outputs.end_silence()
 
     def disconnect(self) -> None:
-        """Remove its files, unless the profile names their folder; no effect if it is not connected."""
+        """Remove its files, unless the profile names their folder. No effect if it is not connected."""
         self._outputs = None
         if self.folder is not None and not self._given:
             shutil.rmtree(self.folder, ignore_errors=True)

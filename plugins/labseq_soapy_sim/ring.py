@@ -1,4 +1,4 @@
-"""The file that a simulated radio shares with other processes: its state, and the samples it received."""
+"""The file with a simulated radio's state and received samples, shared with other processes."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ HEADER: Final = np.dtype(
 )
 """State of the radio: samples received, whether it transmits, errors, settings.
 
-``silent``: samples of silence up to now, ``silence``: those of the last silence that is over. Sample n is
-played at t0_s + n / (rate_hz speed) of ``time.monotonic``. ``frequency_hz``: zero of the samples;
-``oscillator_hz``: where it leaks; ``start_s``: when the first sample of a channel was played.
+``silent`` counts samples of the present silence, ``silence`` of the last one. Sample n is played at t0_s + n
+/ (rate_hz speed) of ``time.monotonic``. ``frequency_hz`` is the zero of the samples, ``oscillator_hz`` where
+it leaks, ``start_s`` when the first sample of a channel was played.
 """
 
 
 class Fault(enum.IntFlag):
-    """Faults of the radio while they are set; an underflow, and a lost or late packet, happen once."""
+    """Faults of the radio while they are set. An underflow, and a lost or late packet, happen once."""
 
     NONE = 0
     UNDERFLOW = enum.auto()
@@ -50,7 +50,7 @@ class Fault(enum.IntFlag):
 
 
 def read_trace(folder: Path) -> list[tuple[float, str, float, float]]:
-    """Changes of the transmitters, with ``record`` among the radio's arguments: time, name, two numbers.
+    """Changes of the transmitters (time, name, two numbers), with ``record`` among the radio's arguments.
 
     "open", "close", "stop", "gain" (channel, dB), "play" (sample n is at the connectors at the first number
     + n / the second).
@@ -65,7 +65,7 @@ def radio_lock(folder: Path) -> FileLock:
 
 
 def create(folder: Path) -> tuple[Any, NDArray[np.uint64]]:
-    """Create the file, or empty it; gives its header and its samples, uint64 (2, SAMPLES), to be written."""
+    """Create or empty the file. Returns its header and its samples, uint64 (2, SAMPLES), for writing."""
     n_bytes = HEADER.itemsize + CHANNELS * SAMPLES * 8
     path = folder / "ring"
     path.touch(0o600)
@@ -110,7 +110,7 @@ class Ring:
 
     @property
     def is_playing(self) -> bool:
-        """Whether the radio plays: a process has it open, and its buffer has not run dry."""
+        """Whether the radio plays, so that a process has it open and its buffer has not run dry."""
         header = self._header
         if not header["is_active"] or not self._is_held():
             return False
@@ -118,7 +118,7 @@ class Ring:
         return bool(late_s <= header["patience_s"])
 
     def latest(self, n: int) -> NDArray[np.complex64]:
-        """The latest samples that it received, complex64 (2, n); fewer if there were fewer."""
+        """The latest samples that it received, complex64 (2, n), fewer if there were fewer."""
         while True:
             end = int(self._header["sent"])
             places = np.arange(max(0, end - n), end) % SAMPLES

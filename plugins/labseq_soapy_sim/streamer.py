@@ -1,4 +1,4 @@
-"""The streaming process of a simulated radio: ``python -m labseq_soapy_sim.streamer``."""
+"""The streaming process of a simulated radio (``python -m labseq_soapy_sim.streamer``)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The messages between labseq and the streaming process: lines of JSON through two pipes.
+"""The messages between labseq and the streaming process, lines of JSON through two pipes.
 
-labseq's first line is a :class:`Setup`; then come commands, each with a key ``do``:
+labseq's first line is a :class:`Setup`. Then come commands, each with a key ``do``:
 
 ==========  =====================================  ==============================================
 ``do``      further keys                           answer
@@ -32,7 +32,7 @@ REF_LOCKED, LO_LOCKED = "ref_locked", "lo_locked"
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What the streaming process needs to know first.
+    """The first message to the streaming process.
 
     Attributes:
         device: Arguments that open the radio.
@@ -41,13 +41,13 @@ class Setup:
         rate_hz: Sample rate.
         oscillator_hz: Frequency of the local oscillators, without their offset.
         lo_offset_hz: Distance of the local oscillators from it.
-        bandwidth_hz: Bandwidth of the analog filters; None: as the radio chooses.
-        gain_db: Gain of each axis; None: the lowest.
-        antenna: Name of the connector; "": as the radio chooses.
-        clock_source: Reference of its clocks; "": as the radio chooses.
+        bandwidth_hz: Bandwidth of the analog filters, None to let the radio choose.
+        gain_db: Gain of each axis, None for the lowest.
+        antenna: Name of the connector, "" to let the radio choose.
+        clock_source: Reference of its clocks, "" to let the radio choose.
         ramp_s: Duration of the ramp to zero at its end.
         max_wait_s: How long labseq may be silent.
-        marker: File that the process writes when it goes on without labseq; deleting it ends the process.
+        marker: File that the process writes when it continues without labseq. Deleting it ends the process.
     """
 
     device: str
@@ -67,7 +67,7 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What the radio reports after it was set up.
+    """The radio's report after it was set up.
 
     Attributes:
         radio: Driver, hardware, serial number and the like.
@@ -78,7 +78,7 @@ class Facts:
         locks: Which clocks and local oscillators are locked, where the radio has sensors for that.
         buffered: Number of samples in its buffer when it takes no more.
         starts_together: Whether both channels started at one time.
-        no_real_time: Why the process has no real-time priority; "" if it has.
+        no_real_time: Why the process has no real-time priority, "" if it has.
     """
 
     radio: Mapping[str, str]
@@ -93,7 +93,7 @@ class Facts:
 
 
 def unlocked(locks: Mapping[str, bool], clock_source: str) -> list[str]:
-    """Which of the radio's locks are open that must not be; its own clock follows no reference."""
+    """Which of the radio's locks are open that must not be. Its own clock follows no reference."""
     own = (REF_LOCKED,) if clock_source in ("", "internal") else ()
     return [name for name, is_locked in locks.items() if not is_locked and name not in own]
 

@@ -1,4 +1,4 @@
-"""The samples for the radio, block by block: a loop, its depth, and the fades from one loop to the next."""
+"""The samples for the radio, block by block, from a loop, its depth, and the fades between loops."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 Samples = NDArray[np.float32]
 
 BLOCK: Final = 1 << 15
-"""Most samples per block: less than a millisecond at any rate that 20 tones need."""
+"""Most samples per block, less than a millisecond at any rate that 20 tones need."""
 
 
 class Output:
     """The signal of both channels.
 
-    At full depth the samples are those of the loop itself, at depth 0 of a buffer of zeros; only ramps
-    and fades cost work. Both amplitudes of a tweezer scale with the fourth root of its depth. The loop is
-    never interrupted, so no phase ever jumps.
+    At full depth the samples are the loop itself, at depth 0 zeros. Only ramps and fades cost work. Both
+    amplitudes of a tweezer scale with the fourth root of its depth. The loop is never interrupted, so no
+    phase ever jumps.
 
     Attributes:
         depth: Depth at the end of the last block, as a fraction of the nominal depth.
@@ -38,10 +38,10 @@ class Output:
         self._made = np.empty((2, 2 * BLOCK), np.float32)
 
     def load(self, loop: Samples, n_fade: int) -> None:
-        """Play another loop: at once if nothing is on, otherwise faded in.
+        """Play another loop, at once if nothing is on, otherwise faded in.
 
         Args:
-            loop: float32 (2, 2 n), I and Q in turn; each loop as long as the first.
+            loop: float32 (2, 2 n), I and Q in turn, each loop as long as the first.
             n_fade: Length of the fade in samples.
         """
         if self._loop is self._silence:
@@ -56,7 +56,7 @@ class Output:
             self._next, self._n_fade, self._n_faded = loop, max(1, n_fade), 0
 
     def ramp(self, depth: float, n_samples: int) -> None:
-        """Change the depth linearly from its present value; the last sample has the new depth.
+        """Change the depth linearly from its present value. The last sample has the new depth.
 
         During a release the ramp starts at once, from 0.
         """
@@ -66,7 +66,7 @@ class Output:
         self._slope, self._goal = (depth - self.depth) / self._n_ramp, depth
 
     def release(self, n_samples: int) -> None:
-        """Silence for some samples; then the loop continues at its depth, as if it had played meanwhile."""
+        """Play silence for some samples. The loop continues at its depth, as if it had played meanwhile."""
         self._n_dark = n_samples
 
     @property
@@ -75,7 +75,7 @@ class Output:
         return self._n_ramp == 0 and self._n_dark == 0 and self._next is None
 
     def block(self) -> Samples:
-        """The next samples, float32 (2, 2 n) with n from 1 to :data:`BLOCK`; valid until the next call."""
+        """The next samples, float32 (2, 2 n) with n from 1 to :data:`BLOCK`. Valid until the next call."""
         n = min(BLOCK, self._loop.shape[1] // 2 - self._at)
         if self._n_ramp:
             n = min(n, self._n_ramp)

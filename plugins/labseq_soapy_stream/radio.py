@@ -1,4 +1,4 @@
-"""A radio as labseq uses it: two tuned channels, and a stream that starts on both at one time."""
+"""A radio with two tuned channels, and a stream that starts on both at one time."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ERRORS: Final = {UNDERFLOW: "underflows", CORRUPTION: "sequence_errors", TIME_ER
 LOCK_S: Final = 2.0
 """How long clocks and oscillators may take to lock."""
 START_S: Final = 0.1
-"""From setting the time of a start to the start."""
+"""Time from setting a start to the start."""
 
 
 def open_radio(open_device: OpenDevice, setup: Setup) -> Device:
@@ -50,7 +50,7 @@ def open_radio(open_device: OpenDevice, setup: Setup) -> Device:
     n_channels, needed = radio.n_channels, max(setup.channels) + 1
     if n_channels < needed:
         radio.close()
-        text = f"it has {n_channels} channel(s) that transmit; expected {needed}, one for each AOD"
+        text = f"it has {n_channels} channel(s) that transmit, not {needed}, one for each AOD"
         raise SoapyError(text)
     return radio
 
@@ -72,7 +72,7 @@ def set_up(radio: Device, setup: Setup) -> Stream:
         _tune(radio, channel, setup.oscillator_hz, setup.lo_offset_hz)
         lowest, highest = radio.gain_range(channel)
         if gain_db is not None and not lowest <= gain_db <= highest:
-            text = f"a gain of {gain_db:g} dB; channel {channel} has {lowest:g} to {highest:g} dB"
+            text = f"no gain of {gain_db:g} dB; channel {channel} has {lowest:g} to {highest:g} dB"
             raise SoapyError(text)
         radio.set("Gain", channel, lowest if gain_db is None else gain_db)
     radio.set_up_stream(sorted(setup.channels), setup.stream)
@@ -80,7 +80,7 @@ def set_up(radio: Device, setup: Setup) -> Stream:
 
 
 def read_back(radio: Device, setup: Setup) -> Facts:
-    """Read the values of both channels back, after the stream is set up: some radios change them then.
+    """Read the values of both channels back after the stream is set up, since some radios change them then.
 
     Raises:
         SoapyError: Its channels have different rates.
@@ -165,7 +165,7 @@ class Stream:
         self.starts_together = False
 
     def activate(self) -> None:
-        """Let the first samples start to play: on all channels at one time, if the radio has a clock.
+        """Let the first samples start to play, on all channels at one time if the radio has a clock.
 
         Raises:
             SoapyError: The radio refuses to transmit.
@@ -178,7 +178,7 @@ class Stream:
         self._activated_s = time.monotonic()
 
     def check_start(self) -> None:
-        """Find out whether the first samples came in time; does not wait until they are played."""
+        """Find out whether the first samples came in time, without waiting until they are played."""
         left_s = self._activated_s + START_S / 2 - time.monotonic()
         if self.starts_together and self.errors(max(0.0, left_s))["late_packets"]:
             self.starts_together = False
@@ -187,12 +187,12 @@ class Stream:
         """Write samples to the stream.
 
         Args:
-            samples: float32 (n_channels, 2 n), I and Q in turn; each row in one piece.
+            samples: float32 (n_channels, 2 n), I and Q in turn, each row in one piece.
             start: Index of the first sample to write.
             timeout_s: How long to wait for room.
 
         Returns:
-            Number of samples that the radio took; 0 if there was no room in time.
+            Number of samples that the radio took, 0 if there was no room in time.
 
         Raises:
             SoapyError: The stream is broken.
@@ -210,7 +210,7 @@ class Stream:
         return max(0, n_taken)
 
     def errors(self, timeout_s: float = 0.0) -> Counter[str]:
-        """How often the radio reported each of :data:`ERRORS` since the last call; waits for the first."""
+        """How often the radio reported each of :data:`ERRORS` since the last call. Waits for the first."""
         while self._knows_status:
             code = self._radio.read_status(timeout_s)
             if code in ERRORS:
@@ -229,7 +229,7 @@ class Stream:
         """Stop playing and close the stream.
 
         Raises:
-            SoapyError: The radio does not obey: its transmitters may still be on.
+            SoapyError: The radio does not obey, and its transmitters may still be on.
         """
         try:
             code = self._radio.deactivate()

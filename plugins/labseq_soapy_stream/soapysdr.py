@@ -43,7 +43,7 @@ _INSTALL: Final = {
 
 
 class SoapyError(Exception):
-    """The library, the radio's module or the radio refused something; the text names it."""
+    """The library, the radio's module or the radio refused something. The text names it."""
 
 
 class LibraryError(SoapyError):
@@ -119,7 +119,7 @@ def library() -> Any:
     """The library, its functions with their signatures.
 
     Raises:
-        LibraryError: It cannot be found; the text says how to install it.
+        LibraryError: It cannot be found. The text says how to install it.
     """
     reason = ""
     for name in _NAMES.get(sys.platform, _NAMES["linux"]):
@@ -137,7 +137,7 @@ def library() -> Any:
 
 
 def _call(name: str, *arguments: Any) -> Any:
-    """Call a function of a radio; raises SoapyError with the library's message if it fails."""
+    """Call a function of a radio. Raises SoapyError with the library's message if it fails."""
     result = getattr(library(), f"SoapySDRDevice_{name}")(*arguments)
     if library().SoapySDRDevice_lastStatus() != 0:
         text = (library().SoapySDRDevice_lastError() or b"").decode(errors="replace")
@@ -146,10 +146,10 @@ def _call(name: str, *arguments: Any) -> Any:
 
 
 class SoapyDevice:
-    """One open radio; all calls come from one thread.
+    """One open radio. All calls come from one thread.
 
     Args:
-        arguments: What opens it, for example "driver=uhd,serial=30AD123".
+        arguments: Its arguments, for example "driver=uhd,serial=30AD123".
 
     Raises:
         SoapyError: There is no library, no such device, or it cannot be opened. Methods raise this if the
@@ -169,7 +169,7 @@ class SoapyDevice:
         self._flags, self._mask, self._time = c_int(0), c_size_t(0), c_longlong(0)
 
     def close(self) -> None:
-        """Close the radio; its stream must be closed."""
+        """Close the radio. Its stream must be closed."""
         _call("unmake", self._device)
 
     def identify(self) -> dict[str, str]:
@@ -195,7 +195,7 @@ class SoapyDevice:
         _call(f"set{what}", self._device, TX, channel, plain)
 
     def get(self, what: str, channel: int) -> float:
-        """Read a value of a channel back: "SampleRate", "Frequency" (of the samples' zero) or "Gain"."""
+        """Read "SampleRate", "Frequency" (of the samples' zero) or "Gain" of a channel back."""
         return float(_call(f"get{what}", self._device, TX, channel))
 
     def gain_range(self, channel: int) -> tuple[float, float]:
@@ -204,7 +204,7 @@ class SoapyDevice:
         return gains.minimum, gains.maximum
 
     def set_frequency(self, channel: int, frequency_hz: float, offset_hz: float) -> None:
-        """Tune the component RF to a frequency plus an offset, and the other components to what is left."""
+        """Tune the component RF to a frequency plus an offset, and the other components to the rest."""
         kwargs = library().SoapySDRKwargs_fromString(f"OFFSET={offset_hz!r}".encode() if offset_hz else b"")
         try:
             _call("setFrequency", self._device, TX, channel, frequency_hz, byref(kwargs))
@@ -258,20 +258,20 @@ class SoapyDevice:
         _call("closeStream", self._device, self._stream)
 
     def activate(self) -> int:
-        """Switch the transmitters on; returns a code."""
+        """Switch the transmitters on, and return a code."""
         return int(_call("activateStream", self._device, self._stream, 0, 0, 0))
 
     def deactivate(self) -> int:
-        """Switch the transmitters off; returns a code."""
+        """Switch the transmitters off, and return a code."""
         return int(_call("deactivateStream", self._device, self._stream, 0, 0))
 
     def write(self, samples: Samples, start: int, start_ns: int | None, timeout_s: float) -> int:
         """Send samples.
 
         Args:
-            samples: float32 (n_channels, 2 n), I and Q in turn; each row in one piece.
+            samples: float32 (n_channels, 2 n), I and Q in turn, each row in one piece.
             start: Index of the first sample to send.
-            start_ns: Time of the radio's clock at which it is played; None: after the one before.
+            start_ns: Time of the radio's clock at which it is played, None for right after the sample before.
             timeout_s: How long to wait for room.
 
         Returns:
@@ -285,7 +285,7 @@ class SoapyDevice:
         return int(self._write(*place, n_samples, byref(self._flags), start_ns or 0, wait_us))
 
     def read_status(self, timeout_s: float) -> int:
-        """Wait for an event of the stream; returns its code."""
+        """Wait for an event of the stream, and return its code."""
         places = byref(self._mask), byref(self._flags), byref(self._time)
         return int(self._status(self._device, self._stream, *places, round(timeout_s * 1e6)))
 

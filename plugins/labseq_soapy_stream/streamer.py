@@ -1,4 +1,4 @@
-"""The process that keeps the radio supplied: ``python -m labseq_soapy_stream.streamer``.
+"""The process that keeps the radio supplied (``python -m labseq_soapy_stream.streamer``).
 
 With ``--off DEVICE CHANNEL ...`` it only sets the lowest gains of a radio.
 
@@ -30,12 +30,12 @@ from labseq_soapy_stream.radio import Device, OpenDevice, Stream, lower_gains, o
 from labseq_soapy_stream.soapysdr import SoapyDevice, SoapyError
 
 STALL_S: Final = 2.0
-"""A stream that takes no samples for so long is dead."""
+"""A stream that takes no samples for this long counts as dead."""
 STATUS_S: Final = 0.2
 WRITE_S: Final = 0.1
 MARKER_S: Final = 0.1
 PRIORITY: Final = 10
-"""Real-time priority, of 1 to 99: above all ordinary processes, below the threads of a radio's module."""
+"""Real-time priority, of 1 to 99, above all ordinary processes, below the threads of a radio's module."""
 
 Message = Mapping[str, Any]
 
@@ -64,7 +64,7 @@ class CommandReader:
 
 
 class StatusWriter:
-    """Sends messages to labseq in a thread: a labseq that hangs must not block the stream."""
+    """Sends messages to labseq in a thread, so that a hung labseq does not block the stream."""
 
     def __init__(self, pipe: int) -> None:
         self._pipe = pipe
@@ -77,7 +77,7 @@ class StatusWriter:
         self._outbox.put(message)
 
     def finish(self) -> None:
-        """Wait until all messages were sent; not long, for labseq may hang, and not if it is gone."""
+        """Wait until all messages were sent, but not long, in case labseq hangs, and not if it is gone."""
         self._outbox.put(None)
         self._thread.join(1.0)
 
@@ -108,13 +108,13 @@ class Streamer:
         self._terminated = False
 
     def fill(self) -> int:
-        """Fill the radio's buffer with silence; returns how many samples it holds."""
+        """Fill the radio's buffer with silence, and return how many samples it holds."""
         silence, first = self._output.block(), 0
         while self._written < self._rate_hz:
             taken = self._stream.write(silence, 0, 0.0)
             self._written += taken
             first = first or taken
-            if 2 * taken <= first:  # full, except for what it has played meanwhile
+            if 2 * taken <= first:  # full, except for samples played meanwhile
                 break
         self._buffered = self._written
         self._stream.check_start()
@@ -131,7 +131,7 @@ class Streamer:
                 self._watch_labseq()
 
     def terminate(self, *_: object) -> None:
-        """Ramp down and end; handler of a signal."""
+        """Ramp down and end, as handler of a signal."""
         self._terminated = True
 
     def _execute(self, message: dict[str, Any]) -> None:
@@ -176,7 +176,7 @@ class Streamer:
             self._task = None
 
     def _report_errors(self) -> None:
-        """Count what the radio reports, and tell labseq at once, or that there is nothing now and then."""
+        """Count the radio's errors, and tell labseq at once, or now and then that there are none."""
         found = self._stream.errors()
         self._errors["all"].update(found)
         if self._output.depth > 0.0:
@@ -226,7 +226,7 @@ def repeated(loop: Samples) -> Samples:
 
 
 def raise_priority() -> str:
-    """Give this thread, and those that it starts, real-time priority; returns why not, or ""."""
+    """Give this thread, and threads that it starts, real-time priority. Returns why not, or ""."""
     if sys.platform != "linux":
         return "set under Linux only"
     try:
@@ -265,7 +265,7 @@ def stream(
 
 
 def closed(part: Device | Stream) -> bool:
-    """Close a radio or its stream; returns whether it obeyed. An error that came before is reported."""
+    """Close a radio or its stream, and return whether it obeyed. An earlier error is reported."""
     with contextlib.suppress(SoapyError):
         part.close()
         return True
@@ -280,7 +280,7 @@ def remove_own(file: Path) -> None:
 
 
 def main(open_device: OpenDevice) -> int:
-    """Run the process; returns its exit code."""
+    """Run the process, and return its exit code."""
     if sys.argv[1:2] == ["--off"]:
         try:
             lower_gains(open_device, sys.argv[2], [int(channel) for channel in sys.argv[3:]])

@@ -1,4 +1,4 @@
-"""One simulated card behind the driver's functions: calls, errors, time."""
+"""One simulated card behind the driver's functions, with calls, errors and time."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from labseq_spcm_sim.output import SampleSpan
 from labseq_spcm_sim.setup import M4I6631, CardModel, ErrorInfo, Number, Refusal
 
 DRIVER_VERSION: Final = (7 << 24) | (9 << 16) | 22000
-"""A version that ``spcm_core`` accepts; the vendor has no such version."""
+"""A version that ``spcm_core`` accepts. The vendor has no such version."""
 LOG_SIZE: Final = 100_000
 EDGE_V: Final = 3.3
-"""Height of a pulse at Ext0, of LVTTL."""
+"""Height of an LVTTL pulse at Ext0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +33,9 @@ class LogEntry:
     """One write to a register, refused or not.
 
     Attributes:
-        time_s: When, on the session's clock.
+        time_s: Time of the write, on the session's clock.
         register: Its number.
-        value: What was written.
+        value: Value that was written.
     """
 
     time_s: float
@@ -46,16 +46,15 @@ class LogEntry:
 class SimulatedCard:
     """A Spectrum M4i.6631-x8 in software, which behaves as the real one.
 
-    It is thread-safe. Time is the session's clock: replays and transfers take as
-    long as they would, but only on that clock.
+    It is thread-safe. Replays and transfers take as long as on a real card, but only on the session's clock.
 
     Args:
         clock: The session's time.
-        model: What card it is.
+        model: Model of the card.
         serial_number: Its serial number.
-        keep_history: Keep what was played until ``forget``; otherwise each start of the card drops it, and
+        keep_history: Keep played samples until ``forget``. Otherwise each start of the card drops them, and
             nothing of a stream is kept.
-        faults: What it does otherwise than by default.
+        faults: Its differences from the default.
 
     Attributes:
         log: The latest register writes, in order.
@@ -105,8 +104,8 @@ class SimulatedCard:
         """A pulse from 0 V at the input Ext0, now.
 
         Returns:
-            Whether the card accepted it as a trigger; it does not if it is not started, not
-            enabled, set to another source, or set to a level that the pulse does not cross.
+            Whether the card accepted it as a trigger. It does not if it is not started, not enabled, set to
+            another source, or set to a level that the pulse does not cross.
         """
         with self._lock:
             return self._machine.pulse(voltage_v, self._advance())
@@ -118,13 +117,13 @@ class SimulatedCard:
             self._edges_s.sort()
 
     def call(self, step: Callable[[], float | None] | None) -> None:
-        """Call a step of the driver's whenever it is due, as a thread of its own would; for virtual clocks.
+        """Call a step of the driver's whenever it is due, as a thread would, for virtual clocks.
 
         Args:
-            step: Returns after how many seconds it is due again, None if never. None: no more steps.
+            step: Returns after how many seconds it is due again, None if never. None stops the steps.
         """
         with self._lock:
-            now_s = self._now() if step is None else self._advance()  # what was due until now first
+            now_s = self._now() if step is None else self._advance()  # everything due until now first
             self._step, self._step_s = step, max(now_s, self._held_up_s)
 
     def hold_up(self, duration_s: float) -> None:
@@ -133,12 +132,12 @@ class SimulatedCard:
             self._step_s = self._held_up_s = self._advance() + duration_s
 
     def played(self, channel: int) -> list[SampleSpan]:
-        """The output of a channel up to now, in time's order; between the spans there is silence."""
+        """The output of a channel up to now, in time's order. Between the spans there is silence."""
         with self._lock:
             return self._machine.played(channel, self._advance())
 
     def forget(self, before_s: float) -> None:
-        """Drop what was played before a time, to free memory in long runs."""
+        """Drop samples played before a time, to free memory in long runs."""
         with self._lock:
             self._advance()
             self._machine.forget(before_s)
@@ -172,16 +171,16 @@ class SimulatedCard:
         with self._lock:
             return tuple(amplifier.enabled for amplifier in self._machine.amplifiers)
 
-    # Functions of the driver library; most return the vendor's error code
+    # Functions of the driver library, most of which return the vendor's error code
 
     def acquire(self) -> bool:
-        """Open it for its only owner; False if it has one."""
+        """Open it for its only owner. False if it has one."""
         with self._lock:
             is_free, self._is_open = not self._is_open, True
             return is_free
 
     def release(self) -> None:
-        """Close it: transfers end, everything else goes on."""
+        """Close it. Transfers end, everything else goes on."""
         with self._lock:
             self._machine.stop_dma(self._advance())
             self._machine.buffer = None
@@ -189,7 +188,7 @@ class SimulatedCard:
 
     @property
     def step_time_s(self) -> float:
-        """The time of the step that is being called, else that of the clock."""
+        """The time of the step that is being called, else the clock's."""
         return self._now()
 
     def _now(self) -> float:
@@ -243,7 +242,7 @@ class SimulatedCard:
 
     def _take(self, duration_s: float) -> None:
         """Take the time that a call takes."""
-        with suppress(StopRequested):  # nothing may pass through C; the caller's next wait raises it
+        with suppress(StopRequested):  # nothing may pass through C, so the caller's next wait raises it
             self._clock.sleep(duration_s)
 
     def write_all(self, writes: Iterable[tuple[int, Number]]) -> int:
@@ -251,7 +250,7 @@ class SimulatedCard:
         code = self._write_all(writes)
         busy_s, self._machine.busy_s = self._machine.busy_s, 0.0
         if busy_s:
-            with suppress(StopRequested):  # nothing may pass through C; the caller's next wait raises it
+            with suppress(StopRequested):  # nothing may pass through C, so the caller's next wait raises it
                 self._clock.sleep(busy_s)
         return code
 
@@ -271,7 +270,7 @@ class SimulatedCard:
             return r.ERR_OK
 
     def read(self, register: int) -> tuple[int, Number]:
-        """Read one register: the error code and the value."""
+        """Read one register. Returns the error code and the value."""
         with self._lock:
             if self._error.code:
                 return r.ERR_LASTERR, 0
@@ -298,7 +297,7 @@ class SimulatedCard:
             return r.ERR_OK
 
     def continuous_buffer(self) -> tuple[int, int]:
-        """Address and length of the driver's continuous buffer; 0 and 0 if none was set up."""
+        """Address and length of the driver's continuous buffer, 0 and 0 if none was set up."""
         n_bytes = self.model.continuous_bytes
         if n_bytes and self._continuous is None:
             self._continuous = mmap.mmap(-1, n_bytes)
@@ -306,7 +305,7 @@ class SimulatedCard:
         return self._machine.continuous, n_bytes
 
     def invalidate(self) -> int:
-        """Forget the transfer buffer; the manual wants the transfer stopped by a command before."""
+        """Forget the transfer buffer. By the manual, a command must stop the transfer before."""
         with self._lock:
             if self._error.code:
                 return r.ERR_LASTERR

@@ -1,4 +1,4 @@
-"""Ways in which real cards may differ from what the driver assumes, for the simulated card."""
+"""Possible differences of real cards from the driver's assumptions, for the simulated card."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ COPY_BYTES_PER_S: Final = 8e9
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """What the simulated card does otherwise than by default.
+    """Differences of the simulated card from the default.
 
     Attributes:
         copies_samples: Samples are copied when they are handed over, as with a card in another computer.
@@ -34,7 +34,7 @@ class Faults:
         fifo_short_bytes: By how much the on-board FIFO is smaller than its register says.
         pinning_s: Time to name a transfer buffer, in seconds.
         underrun_not_ready: After an underrun the card reports the overrun, but not that it is ready.
-        write_speeds: Pairs of notify size in bytes and speed in bytes per second; none: that of the bus.
+        write_speeds: Pairs of notify size in bytes and speed in bytes per second, none for the bus speed.
     """
 
     copies_samples: bool = False
@@ -45,7 +45,7 @@ class Faults:
     write_speeds: tuple[tuple[int, float], ...] = ()
 
     def write_speed(self, notify_bytes: int, bus_bytes_per_s: float, *, continuous: bool) -> float:
-        """Speed of a transfer, in bytes per second; between the notify sizes of the table by a power law."""
+        """Speed of a transfer, in bytes per second, between the notify sizes of the table by a power law."""
         if not self.write_speeds:
             return bus_bytes_per_s
         if continuous:
@@ -66,7 +66,7 @@ class LateCounter:
         self._points: deque[tuple[float, float]] = deque([(-math.inf, 0.0)])
 
     def add(self, time_s: float, n_bytes: float) -> None:
-        """The count at a time; between two times it grows linearly."""
+        """Add the count at a time. Between two times it grows linearly."""
         self._points.append((time_s, n_bytes))
         while len(self._points) > 1 and self._points[1][0] <= time_s - self._lag_s:
             self._points.popleft()

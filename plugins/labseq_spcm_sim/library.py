@@ -103,7 +103,7 @@ class Library:
         return bool(self._vendor)
 
     def _exported(self, name: str) -> Any:
-        """A bare C function pointer: no argument types, as for a function of a library."""
+        """A bare C function pointer without argument types, as for a function of a library."""
         result, arguments = SIGNATURES[name]
         callback = ctypes.CFUNCTYPE(result, *arguments)(self._routed(name))
         self._callbacks.append(callback)
@@ -129,7 +129,7 @@ class Library:
     def _is_ours(self, name: str, first: Any) -> bool:
         if name == "spcm_hOpen":
             return (first or b"").decode(errors="replace") in self.cards
-        return first in self._handles  # closed ones too: the vendor's library must never see them
+        return first in self._handles  # closed ones too, which the vendor's library must never see
 
     # The functions, by their names in small letters, with the arguments of their signatures.
 
@@ -257,24 +257,24 @@ def _put_text(address: int, text: str, n_bytes: int) -> None:
 
 
 PREFIX: Final = "simulated"
-"""Device names that begin like this belong to simulated cards; the vendor's never do."""
+"""Device names that begin like this belong to simulated cards. The vendor's never do."""
 
 _LOCK: Final = threading.Lock()
 _LIBRARIES: Final[list[Library]] = []
-"""The library of this process, once there is one: ``spcm_core`` keeps it until the process ends."""
+"""The library of this process, once there is one. ``spcm_core`` keeps it until the process ends."""
 
 
 class SimulatedLibrary:
-    """What the driver of the AWG opens instead of the vendor's library: ``spcm_core`` with a simulated card.
+    """``spcm_core`` with a simulated card, which the driver opens instead of the vendor's library.
 
     Args:
-        name: "simulated" for a new card at each ``connect``; another name for one that
-            :func:`install` made available.
+        name: "simulated" for a new card at each ``connect``, another name for a card that :func:`install`
+            made available.
         clock: The session's time.
-        simulation: Receives what the card plays, if it implements ``ReceivesOutput``.
+        simulation: Receives the card's output, if it implements ``ReceivesOutput``.
         row_channel: Channel that drives the row axis.
-        column_channel: Channel that drives the columns; None: the other one of 0 and 1.
-        new_card: Makes the card; takes the arguments of :class:`SimulatedCard`.
+        column_channel: Channel that drives the columns, None for the other of 0 and 1.
+        new_card: Makes the card. Takes the arguments of :class:`SimulatedCard`.
 
     Attributes:
         card: The new card in this process, while connected.
@@ -309,7 +309,7 @@ class SimulatedLibrary:
             self._simulation.warm()
 
     def connect(self) -> str:
-        """Make the card available; returns its device name."""
+        """Make the card available, and return its device name."""
         if self._name != PREFIX:
             return self._name
         received = isinstance(self._simulation, ReceivesOutput)
@@ -332,7 +332,7 @@ class SimulatedLibrary:
         self.card = None
 
     def functions(self) -> tuple[int, int]:
-        """Addresses of the C functions that read and that write a register of 64 bits."""
+        """Addresses of the C functions that read and write a register of 64 bits."""
         functions = _library().functions
         read, write = (
             ctypes.cast(functions[name], ctypes.c_void_p).value or 0
@@ -341,7 +341,7 @@ class SimulatedLibrary:
         return read, write
 
     def call_in_virtual_time(self, step: Callable[[], float | None] | None) -> bool:
-        """Have the card call a driver's step whenever it is due; False if time is real."""
+        """Have the card call a driver's step whenever it is due. False if time is real."""
         card = self.card or _library().cards.get(self._name)
         if not self._clock.virtual or card is None:
             return False
@@ -349,12 +349,12 @@ class SimulatedLibrary:
         return True
 
     def step_time_s(self) -> float:
-        """The time of the step that is being called, which may be earlier than that of the clock."""
+        """The time of the step that is being called, which may be earlier than the clock's."""
         card = self.card or _library().cards[self._name]
         return card.step_time_s
 
     def emergency(self, script: Path, n_outputs: int) -> Emergency | None:  # noqa: ARG002 - for a real card
-        """None: the card is in this process, and dies with it."""
+        """None, since the card is in this process, and dies with it."""
         return None
 
 
@@ -366,7 +366,7 @@ class CardOutputs:
     Args:
         card: The card.
         row_channel: Channel that drives the row axis.
-        column_channel: Channel that drives the columns; None: the other one of 0 and 1.
+        column_channel: Channel that drives the columns, None for the other of 0 and 1.
     """
 
     def __init__(self, card: SimulatedCard, row_channel: int, column_channel: int | None = None) -> None:
@@ -375,7 +375,7 @@ class CardOutputs:
         self._reported_s = -math.inf
 
     def played(self, until_s: float) -> tuple[list[RfSpan], list[RfSpan]]:
-        """What the row output and the column output played since the last call, in time's order."""
+        """The spans that the row output and the column output played since the last call, in time's order."""
         rows, columns = (self._since(channel, until_s) for channel in self._channels)
         self._card.forget(until_s)
         self._reported_s = max(self._reported_s, until_s)
@@ -397,7 +397,7 @@ def _rf_span(span: SampleSpan, whole: SampleSpan) -> RfSpan:
 
 
 def _loop_tones(span: SampleSpan) -> RfTones:
-    """Samples that repeat as the tones that they are made of, but for those lost in their rounding."""
+    """Samples that repeat, as their tones, except tones lost in their rounding."""
     n = len(span.samples)
     spectrum = np.fft.rfft(np.roll(span.samples, -span.first)) * (2 / n)
     bins = np.flatnonzero(np.abs(spectrum) > 1.0)
@@ -411,13 +411,13 @@ def install(card: SimulatedCard, name: str = "") -> str:
 
     Args:
         card: The card.
-        name: Its device name, which begins with "simulated"; by default one that is free.
+        name: Its device name, which begins with "simulated", by default a free one.
 
     Returns:
         The device name, for ``spcm.Card(name)``.
 
     Raises:
-        DeviceError: The name is taken, or could be that of a real card.
+        DeviceError: The name is taken, or could be a real card's.
     """
     with _LOCK:
         library = _library()
@@ -434,7 +434,7 @@ def install(card: SimulatedCard, name: str = "") -> str:
 
 @contextmanager
 def installed(card: SimulatedCard, name: str = "") -> Generator[str]:
-    """Within the block the card is available; gives its device name."""
+    """Make the card available within the block, and give its device name."""
     name = install(card, name)
     try:
         yield name
@@ -463,7 +463,7 @@ def _vendor() -> Any:
 
 
 def _library() -> Library:
-    """The library of this process; the first call imports ``spcm_core``, even if it was imported before."""
+    """The library of this process. The first call imports ``spcm_core``, even if it was imported before."""
     if not _LIBRARIES:
         library = Library(_vendor())
         for name in [name for name in sys.modules if name.partition(".")[0] in ("spcm", "spcm_core")]:

@@ -1,4 +1,4 @@
-"""The card behind its driver: registers, memory, one run at a time, and what it plays."""
+"""The card behind its driver, with registers, memory, one run at a time, and its output."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ class Record:
     sample_rate_hz: float
 
     def span(self, channel: int) -> SampleSpan:
-        """The samples of one channel; the amplifier adds the voltage."""
+        """The samples of one channel. The amplifier adds the voltage."""
         column = self.stretch.samples[:, self.channels.index(channel)]
         return SampleSpan(self.stretch.start_s, self.sample_rate_hz, column, 0, self.stretch.n_samples, 0.0)
 
 
 class Machine:
-    """The state of one card. Every call gets the time; nothing here waits.
+    """The state of one card. Every call gets the time. Nothing here waits.
 
     Args:
-        model: What card it is.
-        keeps_streams: Whether samples of streams are kept, not only those of replays.
-        faults: What it does otherwise than by default.
+        model: Model of the card.
+        keeps_streams: Whether samples of streams are kept, as well as of replays.
+        faults: Its differences from the default.
 
     Attributes:
         continuous: Address of the driver's continuous buffer, whose length the model has.
@@ -108,7 +108,7 @@ class Machine:
         return [Record(stretch, self.setup.channels, self.setup[r.SPC_SAMPLERATE]) for stretch in stretches]
 
     def played(self, channel: int, now_s: float) -> list[SampleSpan]:
-        """What reached the connector of a channel up to now, in time's order."""
+        """Spans that reached the connector of a channel up to now, in time's order."""
         amplifier = self.amplifiers[channel]
         parts: list[SampleSpan] = []
         for record in self.samples + self._run_samples(now_s):
@@ -117,7 +117,7 @@ class Machine:
         return sorted(parts, key=lambda part: part.start_s)
 
     def forget(self, before_s: float) -> None:
-        """Drop what was played before a time."""
+        """Drop samples played before a time."""
         self.samples = [record for record in self.samples if record.span(record.channels[0]).end_s > before_s]
         if self.fifo is not None:
             self.fifo.forget(before_s)
@@ -164,7 +164,7 @@ class Machine:
     # Sequence mode
 
     def _set_mode(self, mode: int) -> None:
-        """The memory is divided in the mode STD_SEQUENCE, and whole in the others."""
+        """Divide the memory in the mode STD_SEQUENCE, and leave it whole in the others."""
         if (mode == r.SPC_REP_STD_SEQUENCE) != isinstance(self.memory, SequenceMemory):
             is_divided = mode == r.SPC_REP_STD_SEQUENCE
             n_channels = len(self.setup.channels)
@@ -177,7 +177,7 @@ class Machine:
         return self.memory
 
     def _write_sequence(self, register: int, value: int) -> None:
-        """Write a register of the sequence mode; steps in use must lead to samples that are there."""
+        """Write a register of the sequence mode. Steps in use must lead to samples that are there."""
         memory, run = self._sequence_memory, self.run
         if not isinstance(run, SequenceRun):
             memory.write(register, value, None)
@@ -205,7 +205,7 @@ class Machine:
     # Commands
 
     def _command(self, command: int, now_s: float) -> None:
-        """Carry out a command: one or several M2CMD bits."""
+        """Carry out a command of one or several M2CMD bits."""
         if command & WAITS:
             raise Refusal(r.ERR_FNCNOTSUPPORTED, "the simulator does not wait; read SPC_M2STATUS instead")
         if command & r.M2CMD_DATA_STARTDMA and command & r.M2CMD_CARD_START:
@@ -234,7 +234,7 @@ class Machine:
                 self.run.drop_trigger()
 
     def _write_setup(self, now_s: float) -> None:
-        """The set-up is written to the card: its relays follow the registers."""
+        """Write the set-up to the card, so that its relays follow the registers."""
         if self.setup.write_to_card():
             self.busy_s = PLL_LOCK_S
         for register, channel in OUTPUTS.items():
@@ -242,7 +242,7 @@ class Machine:
                 self.amplifiers[channel].enable(bool(self.setup[register]), now_s)
 
     def _reset(self, now_s: float) -> None:
-        """Everything as after power-on, outputs off."""
+        """Set everything as after power-on, outputs off."""
         if self.running:
             self._end_run(now_s)
         for amplifier in self.amplifiers:
@@ -278,7 +278,7 @@ class Machine:
             self.run.trigger(now_s + trigger_delay_s(self.setup[r.SPC_SAMPLERATE]))
 
     def pulse(self, voltage_v: float, now_s: float) -> bool:
-        """A pulse from 0 V at the input Ext0; returns whether the card accepted it as a trigger."""
+        """A pulse from 0 V at the input Ext0. Returns whether the card accepted it as a trigger."""
         on_card = self.setup.on_card
         level_v = on_card(r.SPC_TRIG_EXT0_LEVEL0) / 1000
         accepted = (
@@ -348,7 +348,7 @@ class Machine:
         return bool(self.memory.uploads) or (self.fifo is not None and self.fifo.is_transferring)
 
     def stop_dma(self, now_s: float) -> None:
-        """What has not arrived is lost."""
+        """Stop the transfer. Data that have not arrived are lost."""
         self.memory.drop()
         if self.fifo is not None:
             self.fifo.switch_dma(on=False, now_s=now_s)

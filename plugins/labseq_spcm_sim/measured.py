@@ -17,11 +17,11 @@ NewCard = Callable[..., SimulatedCard]
 
 
 def card_with(faults: Mapping[str, Any], model: str = "") -> NewCard:
-    """What makes simulated cards for the settings of the driver.
+    """Factory of simulated cards for the settings of the driver.
 
     Args:
         faults: Its section ``faults``.
-        model: Name of a model; "": an M4i.6631-x8.
+        model: Name of a model, "" for an M4i.6631-x8.
 
     Raises:
         ConfigError: The file of a first contact is missing, or was edited.
@@ -47,7 +47,7 @@ def card_with(faults: Mapping[str, Any], model: str = "") -> NewCard:
 
 
 def measured_card(path: Path) -> NewCard:
-    """What makes cards that do what a first contact has measured.
+    """Factory of cards that behave as a first contact has measured.
 
     Raises:
         ConfigError: The file is missing, or was edited.

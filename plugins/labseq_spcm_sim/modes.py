@@ -1,4 +1,4 @@
-"""The modes that play samples: STD_SINGLE from the on-board memory, FIFO_SINGLE as a stream."""
+"""The modes that play samples, STD_SINGLE from the on-board memory and FIFO_SINGLE as a stream."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Buffer:
     Attributes:
         address: Where it starts.
         n_bytes: Its length.
-        notify_bytes: Granularity in which the card reports what it has transferred; 0: all at once.
+        notify_bytes: Granularity in which the card reports transferred bytes, 0 for all at once.
     """
 
     address: int
@@ -37,7 +37,7 @@ class Buffer:
     notify_bytes: int
 
     def check(self, kind: int, direction: int, offset: int) -> None:
-        """Refuse what the driver refuses, and a buffer that is not aligned to a page."""
+        """Refuse a buffer as the driver does, also if it is not aligned to a page."""
         if kind != r.SPCM_BUF_DATA:
             raise refuse(kind, f"the buffer type {r.SPCM_BUF_DATA}")
         if direction != r.SPCM_DIR_PCTOCARD:
@@ -70,7 +70,7 @@ class Memory:
     """
 
     def __init__(self) -> None:
-        self._uploaded: list[Samples] = []  # the latest first; those behind it are longer
+        self._uploaded: list[Samples] = []  # the latest first, and longer ones behind it
         self._idle_s = -math.inf
         self.uploads: deque[tuple[float, Samples]] = deque()
 
@@ -80,15 +80,15 @@ class Memory:
         self.uploads.append((self._idle_s, data))
 
     def drop(self) -> None:
-        """What has not arrived is lost."""
+        """Drop data that have not arrived."""
         self.uploads.clear()
 
     def store(self, data: Samples) -> None:
-        """Data arrive; a replay that has begun keeps the old content."""
+        """Store arriving data. A replay that has begun keeps the old content."""
         self._uploaded = [data, *(older for older in self._uploaded if len(older) > len(data))]
 
     def read(self, n_samples: int, n_channels: int) -> Samples:
-        """The content, int16 (n_samples, n_channels); zeros where nothing was ever written."""
+        """The content, int16 (n_samples, n_channels), zeros where nothing was ever written."""
         n = n_samples * n_channels
         found = np.zeros(0, np.int16)
         for data in self._uploaded:
@@ -104,7 +104,7 @@ class Stretch:
 
     Attributes:
         start_s: When the first one was at the output.
-        samples: int16 (n, n_channels); repeats.
+        samples: int16 (n, n_channels), which repeats.
         n_samples: How many were played, per channel.
     """
 
@@ -140,7 +140,7 @@ class Run(Protocol):
 
 
 def cut(stretches: list[Stretch], sample_rate_hz: float, now_s: float) -> list[Stretch]:
-    """Only what has been played by now."""
+    """The samples played by now."""
     parts: list[Stretch] = []
     for stretch in stretches:
         n_samples = min(stretch.n_samples, math.floor((now_s - stretch.start_s) * sample_rate_hz + ROUNDING))
@@ -150,12 +150,12 @@ def cut(stretches: list[Stretch], sample_rate_hz: float, now_s: float) -> list[S
 
 
 class Replay:
-    """STD_SINGLE: plays the memory, after the first trigger.
+    """STD_SINGLE, which plays the memory after the first trigger.
 
     Args:
         content: Returns the memory, int16 (n, n_channels), as it is when the replay begins.
         sample_rate_hz: Sample rate.
-        loops: How often the memory is played; 0: until the stop.
+        loops: How often the memory is played, 0 for until the stop.
     """
 
     failed = False
@@ -173,7 +173,7 @@ class Replay:
         self.finished = now_s >= self._end_s
 
     def trigger(self, out_s: float) -> None:
-        """Begin; later triggers have no effect."""
+        """Begin. Later triggers have no effect."""
         if not self._stretches:
             samples = self._content()
             n_samples = len(samples) * self._loops if self._loops else 2**62
@@ -196,11 +196,11 @@ def is_silent(data: Samples) -> bool:
 
 
 class Fifo:
-    """FIFO_SINGLE: a ring buffer in the PC, the bus, the on-board memory as a FIFO, and the output.
+    """FIFO_SINGLE with a ring buffer in the PC, the bus, the on-board memory as a FIFO, and the output.
 
     Bytes are handed over by the user, fetched by the bus while there is room on the card, and played from
-    the trigger on. The bus reads a whole block when it fetches the first byte of it: until then the user may
-    change it. When the output finds none it stops: an underrun.
+    the trigger on. The bus reads a whole block when it fetches the first byte of it. Until then the user may
+    change it. When the output finds none it stops with an underrun.
 
     Args:
         buffer: The ring.
@@ -208,16 +208,16 @@ class Fifo:
         sample_rate_hz: Sample rate.
         room_bytes: How much of the on-board memory is used.
         bus_bytes_per_s: Speed of the bus.
-        faults: What the card does otherwise.
-        keeps: Whether what is played is kept for :meth:`played`.
+        faults: The card's differences from the default.
+        keeps: Whether played samples are kept for :meth:`played`.
 
     Attributes:
         handed: Bytes handed over so far.
-        fetched: Those that the bus has fetched.
-        n_played: Those that the output has played.
-        total: Those to play until the end; inf until the stop.
-        play_s: When the output starts; inf if that is not known.
-        is_transferring: Whether the bus fetches what is handed over.
+        fetched: Bytes that the bus has fetched.
+        n_played: Bytes that the output has played.
+        total: Bytes to play until the end, inf for until the stop.
+        play_s: When the output starts, inf if that is not known.
+        is_transferring: Whether the bus fetches handed-over bytes.
         finished: Whether everything was played.
         failed: Whether the output found no data.
     """
@@ -245,7 +245,7 @@ class Fifo:
         self.is_transferring = self.finished = self.failed = False
 
     def set_length(self, n_samples: int) -> None:
-        """The card is started, with the number of samples per channel to play; 0: until the stop."""
+        """Set the number of samples per channel to play at the start, 0 for until the stop."""
         self.total = n_samples * self._frame if n_samples else math.inf
         self._room += OUTPUT_FIFO_BYTES
 
@@ -261,7 +261,7 @@ class Fifo:
             self._latch()
 
     def switch_dma(self, on: bool, now_s: float) -> None:
-        """Whether the bus fetches what was handed over."""
+        """Let the bus fetch handed-over bytes, or stop it."""
         self.advance(now_s)
         self.is_transferring = on
 
@@ -273,7 +273,7 @@ class Fifo:
     def user_bytes(self) -> int:
         """Bytes that are free for the user, in whole notify sizes, as far as the card has reported it.
 
-        A new buffer counts as full (manual, "Buffer handling"): none are free until some were fetched.
+        A new buffer counts as full (manual, "Buffer handling"), so none are free until some were fetched.
         """
         fetched = math.floor(self._reported.at(self._now_s) + ROUNDING_BYTES)
         notified = fetched - fetched % max(1, self._buffer.notify_bytes)
@@ -301,7 +301,7 @@ class Fifo:
         self._latch()
 
     def _flow(self, now_s: float) -> None:
-        """Let bytes flow until something changes: the start, the end of the data, full, empty, or now."""
+        """Let bytes flow until something changes (the start, the end of the data, full, empty, or now)."""
         drain = self._rate * self._frame if self._now_s >= self.play_s else 0.0
         waiting, fill = self.levels
         speed = 0.0
@@ -328,7 +328,7 @@ class Fifo:
         self.finished = self.n_played >= self.total - ROUNDING_BYTES
 
     def _latch(self) -> None:
-        """Keep the blocks that the bus has begun to fetch: what the user writes there now comes too late."""
+        """Keep the blocks that the bus has begun to fetch, where the user's changes now come too late."""
         block = self._buffer.notify_bytes or self._frame
         begun = min(math.ceil((self.fetched - ROUNDING_BYTES) / block) * block, self.handed)
         begun = self.handed if self._copies else begun
@@ -339,7 +339,7 @@ class Fifo:
                 self._keep(at, self._buffer.fetch(at, min(step, begun - at)))
 
     def _keep(self, start: int, data: Samples) -> None:
-        """Keep samples from a place in the stream, in bytes; no silence, and of equal blocks only one."""
+        """Keep samples from a place in the stream, in bytes, without silence, and equal blocks only once."""
         if is_silent(data):
             return
         data = data.reshape(-1, self._frame // 2)

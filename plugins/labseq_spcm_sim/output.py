@@ -1,4 +1,4 @@
-"""The output of the card: spans of samples, and the amplifier."""
+"""The output of the card, with spans of samples and the amplifier."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SampleSpan:
     Attributes:
         start_s: When the first sample was at the output, on the session's clock.
         sample_rate_hz: Sample rate.
-        samples: int16 (n,): one period of what was played; it repeats.
+        samples: int16 (n,), one period of the played samples, which repeats.
         first: Index in ``samples`` of the first sample played.
         n_samples: How many samples were played.
         amplitude_v: Voltage into 50 Ohm of a sample of 32767.
@@ -65,14 +65,14 @@ class SampleSpan:
 
 @dataclass(slots=True)
 class Amplifier:
-    """The output stage of one channel: on or off, amplitude, the relay between its two paths.
+    """The output stage of one channel, with its relay, its amplitude, and the relay between its two paths.
 
     The settings act at once, also while the card plays. When an amplitude needs the other
     path, the output is off for some time.
 
     Attributes:
         model: The card.
-        changes: (time, volts) from when on the output has had which amplitude; 0 is off.
+        changes: (time, volts) of each change of the output's amplitude, where 0 is off.
     """
 
     model: CardModel

@@ -1,7 +1,7 @@
 """The registers of the card, their values and the error codes, under the vendor's names.
 
-They come from the vendor's package ``spcm_core``: it cannot be imported without a driver library, but its two
-files of constants can.
+They come from the vendor's package ``spcm_core``, which cannot be imported without a driver library, but its
+two files of constants can.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ ERR_OK: Final = 0x0
 SPCM_BUF_DATA: Final = 1000
 SPCM_DIR_PCTOCARD: Final = 0
 TYPE_DOUBLE: Final = 1
-"""Of the driver's C interface: kind and direction of a transfer, type of an entry of a register list."""
+"""Kind and direction of a transfer, and type of an entry of a register list, in the driver's C interface."""
 
 
 def _constants() -> dict[str, int]:

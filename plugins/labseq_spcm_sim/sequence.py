@@ -1,8 +1,8 @@
-"""The mode STD_SEQUENCE: segments of the on-board memory, and the steps that play them.
+"""The mode STD_SEQUENCE, with segments of the on-board memory and the steps that play them.
 
 Source: Spectrum's manual, chapter "Sequence Mode". Where the manual leaves it to the user to take care, the
-simulated card refuses: a segment that the steps in use lead to cannot be written, and no step in use may lead
-to one that was never written or whose samples have not arrived.
+    simulated card refuses. A segment that the steps in use lead to cannot be written, and no step in use may
+    lead to a segment that was never written or whose samples have not arrived.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class Step:
 
     Attributes:
         word: The value of its register.
-        n_samples: Size of its segment when the step was written: the driver works out the segment's
-            addresses then, so a step has to be written again after its segment has another size.
+        n_samples: Size of its segment when the step was written. The driver works out the segment's addresses
+            then, so a step has to be written again after its segment has another size.
     """
 
     word: int
@@ -77,7 +77,7 @@ class SequenceMemory(Memory):
         n_channels: Active channels.
 
     Attributes:
-        segments: Segment -> what arrived there, int16 (n, n_channels).
+        segments: Segment -> samples that arrived there, int16 (n, n_channels).
         steps: Number -> step, as far as they were written.
         start_step: The first step after the start.
     """
@@ -91,7 +91,7 @@ class SequenceMemory(Memory):
         self._divide(2)
 
     def _divide(self, n_segments: int) -> None:
-        """Divide the memory; all samples and steps are lost."""
+        """Divide the memory. All samples and steps are lost."""
         self._n_segments = n_segments
         self._sizes: dict[int, int] = {}
         self._arriving: list[int] = []
@@ -104,7 +104,7 @@ class SequenceMemory(Memory):
 
     @property
     def room_bytes(self) -> int:
-        """Bytes of the segment that is selected."""
+        """Bytes of the selected segment."""
         return 2 * self._n_channels * self.size(self._selected)
 
     def write(self, register: int, value: int, used: AbstractSet[int] | None) -> None:
@@ -113,7 +113,7 @@ class SequenceMemory(Memory):
         Args:
             register: Its number.
             value: Its value.
-            used: Segments that the steps in use play; None if the card does not run.
+            used: Segments that the steps in use play, None if the card does not run.
 
         Raises:
             Refusal: Out of range, or not while the card runs, or not while the segment is in use.
@@ -137,7 +137,7 @@ class SequenceMemory(Memory):
             self._divide(value)
 
     def value(self, register: int) -> int:
-        """The value of a register of the sequence mode, the status excepted."""
+        """The value of a register of the sequence mode, except the status."""
         number = register - r.SPC_SEQMODE_STEPMEM0
         if number < MAX_STEPS:
             step = self.steps.get(number)
@@ -176,7 +176,7 @@ class SequenceMemory(Memory):
         self._sizes[self._selected] = n_samples
 
     def check_unused(self, used: AbstractSet[int] | None) -> None:
-        """Refuse to change the segment that is selected while it is in use."""
+        """Refuse to change the selected segment while it is in use."""
         if used is not None and self._selected in used:
             raise Refusal(r.ERR_SEQUENCE, f"segment {self._selected} is in use by the running sequence")
 
@@ -186,26 +186,26 @@ class SequenceMemory(Memory):
         self._arriving.append(self._selected)
 
     def drop(self) -> None:
-        """What has not arrived is lost."""
+        """Drop data that have not arrived."""
         super().drop()
         self._arriving.clear()
 
     def store(self, data: Samples) -> None:
-        """Data arrive in their segment; what is longer there stays behind them."""
+        """Store arriving data in their segment, before any older samples that reach further."""
         segment, new = self._arriving.pop(0), data.reshape(-1, self._n_channels)
         old = self.segments.get(segment, new[:0])
         self.segments[segment] = np.concatenate([new, old[len(new) :]]) if len(old) > len(new) else new
 
     def samples(self, step: Step) -> Samples:
-        """What a step plays once, int16 (n, n_channels); zeros where nothing was ever written."""
+        """Samples that a step plays once, int16 (n, n_channels), zeros where nothing was ever written."""
         content = self.segments[step.segment][: step.n_samples]
         return np.pad(content, ((0, step.n_samples - len(content)), (0, 0)))
 
     def following(self, first: int) -> list[int]:
-        """The numbers of the steps that are played from one on, that one included.
+        """The numbers of the steps that are played from ``first`` on, included.
 
         Raises:
-            Refusal: There is none, or its samples are not there.
+            Refusal: A step is missing, or its samples are not there.
         """
         numbers: list[int] = []
         seen: set[int] = set()
@@ -239,7 +239,7 @@ class Visit:
         number: The step's number.
         step: The step as it was entered.
         first: First sample, counted from the beginning of the output.
-        samples: What it plays again and again; of no length if it is not kept.
+        samples: Samples that it repeats, of no length if they are not kept.
     """
 
     number: int
@@ -249,18 +249,18 @@ class Visit:
 
 
 class SequenceRun:
-    """STD_SEQUENCE: a run from the start step on, after the first trigger.
+    """STD_SEQUENCE, a run from the start step on, after the first trigger.
 
-    What is played next is decided when the samples enter the output FIFO, half of which is in use (manual,
-    "Sequence Mode"), and the status tells what is at the output. A step that is left is left for the step
-    that its register names then. A further trigger counts for the next step that waits for one, until the
-    detection of triggers is disabled (ours).
+    The next step is chosen when the samples enter the output FIFO, of which half is in use (manual, "Sequence
+    Mode"), and the status tells the step at the output. The step that follows is the one in the register at
+    that time. A further trigger counts for the next step that waits for a trigger, until the detection of
+    triggers is disabled (ours).
 
     Args:
         memory: The segments and steps.
         n_channels: Active channels.
         sample_rate_hz: Sample rate.
-        keeps: Whether what is played is kept for :meth:`played`.
+        keeps: Whether played samples are kept for :meth:`played`.
 
     Raises:
         Refusal: The start step leads to steps or samples that are not there.
@@ -292,7 +292,7 @@ class SequenceRun:
         return segments if current is None else segments | {current.step.segment}
 
     def trigger(self, out_s: float) -> None:
-        """The first trigger begins; a later one is for a step that waits for it."""
+        """Begin at the first trigger. A later one is for a step that waits for it."""
         if self._visits:
             self._has_trigger = True
             return
@@ -316,7 +316,7 @@ class SequenceRun:
         return math.floor((now_s - self._out_s) * self._rate + ROUNDING)
 
     def advance(self, now_s: float) -> None:
-        """Decide what enters the output FIFO up to now."""
+        """Choose the steps that enter the output FIFO up to now."""
         if not self._visits:
             return
         self._at = self._at_output(now_s)
@@ -328,7 +328,7 @@ class SequenceRun:
             self.forget(now_s)
 
     def _leave(self, decided: int) -> None:
-        """All loops of a step were played: go on, or play it again for as long as that is decided."""
+        """After all loops of a step, go on, or play it again for as long as that is decided."""
         visit = self._visits[-1]
         step = self._memory.steps[visit.number]
         if step.flags & r.SPCSEQ_END:
@@ -360,7 +360,7 @@ class SequenceRun:
         return cut(stretches, self._rate, now_s)
 
     def forget(self, before_s: float) -> None:
-        """Drop what was played before a time."""
+        """Drop samples played before a time."""
         if self._visits:
             at = self._at_output(before_s)
             n_over = sum(visit.first <= at for visit in self._visits[1:])

@@ -1,12 +1,11 @@
-"""What the card can do, and which values its registers take.
+"""Limits of the card, and the values that its registers take.
 
 Source, where no other is named: Spectrum's manual "M4i.66xx/M4i.96xx", chapters on analog
-outputs, generation modes and trigger; for
-behaviour that the manual does not describe, what ColdMatter (EDMSuite, ``HANDOFF.md``) measured
-on an M4i.9622-x8.
+outputs, generation modes and trigger. Behaviour that the manual does not describe is as ColdMatter (EDMSuite,
+``HANDOFF.md``) measured on an M4i.9622-x8.
 
-A refused value leaves the old one in place, as the card does. What the simulator does not
-model is refused as well, with a text that says so, rather than taken without effect.
+A refused value leaves the old one in place, as on the card. Values that the simulator does not model are
+refused as well, with a text that says so, rather than taken without effect.
 """
 
 from __future__ import annotations
@@ -24,26 +23,26 @@ class CardModel:
 
     Attributes:
         name: Product name.
-        card_type: What the register SPC_PCITYP holds.
+        card_type: Value of the register SPC_PCITYP.
         n_channels: Number of outputs.
         modes: The card modes that its licence and firmware allow.
         memory_samples: On-board memory in samples of 16 bit, shared by the active channels.
         sample_rate_hz: Lowest and highest sample rate.
-        rate_gaps_hz: Sample rates that the clock cannot make: pairs (from, to).
+        rate_gaps_hz: Sample rates that the clock cannot make, as pairs (from, to).
         rate_step_hz: Granularity of the sample rate.
         amplitude_mv: Smallest and largest amplitude into 50 Ohm, in millivolts.
-        low_path_mv: The hysteresis between the amplifier's two paths: above the second the
-            low path is left, below the first the high one.
+        low_path_mv: The hysteresis between the amplifier's two paths. Above the second value the low path is
+            left, below the first the high path.
         relay_s: How long the output is off when the path changes.
         output_relay_s: How long an output is off after its relay was closed (ours, as the path's relay).
-        bus_bytes_per_s: Transfer from the PC.
+        bus_bytes_per_s: Speed of transfers from the PC.
         pcie: Generation and lanes of its slot.
-        temperature_c: What the sensor of the base card reads, in degrees Celsius (ours).
-        amplifier_c: The same of the amplifiers.
-        reference_hz: The signal at the clock input; 0: none.
+        temperature_c: Temperature of the base card's sensor, in degrees Celsius (ours).
+        amplifier_c: Temperature of the amplifiers' sensor.
+        reference_hz: The signal at the clock input, 0 for none.
         reference_divider: The PLL divides it by this, and multiplies the result by whole numbers (ours).
         firmware_type: 1 for its own, 2 for the recovery firmware.
-        continuous_bytes: Length of the driver's continuous buffer, which a user sets up; none by default.
+        continuous_bytes: Length of the driver's continuous buffer, which a user sets up, none by default.
     """
 
     name: str = "M4i.6631-x8"
@@ -81,12 +80,12 @@ MODELS: Final = {
         replace(M4I6622, name="M4i.9622-x8", card_type=0x79622),
     )
 } | {"M4i.6631-x8-hbw": replace(M4I6631, amplitude_mv=(80, 480))}
-"""Cards that can be had by name."""
+"""Cards by name."""
 
 FIRMWARE: Final = 1
 """Version of the main control's firmware (ours)."""
 OUTPUT_FIFO_BYTES: Final = 192 * 1024
-"""Of the FIFO between the on-board memory and the outputs (manual, "Output latency")."""
+"""Size of the FIFO between the on-board memory and the outputs (manual, "Output latency")."""
 PLL_LOCK_S: Final = 200e-3
 """The longest time in which the PLL locks (manual, "PLL Locking Error")."""
 MEMORY_STEP: Final = 32
@@ -95,11 +94,11 @@ MAX_LOOPS: Final = 2**32 - 1
 MAX_SEGMENTS: Final = 1 << 16
 MAX_STEPS: Final = 4096
 MAX_LOOPS_OF_STEP: Final = (1 << 20) - 1
-"""Of the sequence mode."""
+"""Most loops of a step of the sequence mode."""
 
 
 def trigger_delay_s(sample_rate_hz: float) -> float:
-    """From the trigger to the first sample: 476.5 clocks above 625 MS/s, else 238.5, and 16 ns."""
+    """Delay from the trigger to the first sample, 476.5 clocks above 625 MS/s, else 238.5, and 16 ns."""
     return (476.5 if sample_rate_hz > 625e6 else 238.5) / sample_rate_hz + 16e-9
 
 
@@ -111,7 +110,7 @@ class Refusal(Exception):  # noqa: N818 - an answer of the card, not a fault of 
 
     Attributes:
         code: The vendor's error code.
-        text: What was wrong.
+        text: Reason of the refusal.
     """
 
     def __init__(self, code: int, text: str) -> None:
@@ -125,10 +124,10 @@ class ErrorInfo:
     """The error that blocks the driver.
 
     Attributes:
-        code: The vendor's code; 0: none.
+        code: The vendor's code, 0 for none.
         register: The register that was accessed.
         value: The value for it.
-        text: What was wrong.
+        text: Reason of the error.
     """
 
     code: int = r.ERR_OK
@@ -157,13 +156,13 @@ class Setup:
         return int(self._values[register])
 
     def write_to_card(self) -> bool:
-        """Send all values to the card, as WRITESETUP and the start do; before, only the driver has them.
+        """Send all values to the card, as WRITESETUP and the start do. Before, only the driver has them.
 
         Returns:
             Whether the PLL had to lock on an external reference that has changed.
 
         Raises:
-            Refusal: It cannot, as that reference is not there, or has another frequency.
+            Refusal: It cannot, as that reference is missing, or has another frequency.
         """
         clock = [self[register] for register in (r.SPC_CLOCKMODE, r.SPC_REFERENCECLOCK, r.SPC_SAMPLERATE)]
         is_external = clock[0] == r.SPC_CM_EXTREFCLOCK
@@ -229,7 +228,7 @@ def stepped(value: Number, low: float, high: float, step: float = 1) -> Number:
 
 
 def within(low: float, high: float, step: float = 1) -> Rule:
-    """A range and a step; a value between two steps is refused."""
+    """A range and a step. A value between two steps is refused."""
 
     def rule(_setup: Setup, value: Number) -> Number:
         if low <= value <= high and value % step:
@@ -251,7 +250,7 @@ def one_of(*allowed: int) -> Rule:
 
 
 def modelled(*allowed: int) -> Rule:
-    """Values that the simulator models; the real card may know more."""
+    """Values that the simulator models. The real card may know more."""
 
     def rule(_setup: Setup, value: Number) -> Number:
         if value not in allowed:
@@ -281,7 +280,7 @@ def _memory_size(setup: Setup, value: Number) -> Number:
 
 
 def _channels(setup: Setup, value: Number) -> Number:
-    """One, two or all four channels of those that the card has."""
+    """One, two or all four of the card's channels."""
     if not 0 < value < 1 << setup.model.n_channels or int(value).bit_count() == 3:
         raise refuse(value, "a mask of one, two or four channels of the card")
     return int(value)

@@ -1,4 +1,4 @@
-"""``port: simulated``: the driver connects to a simulated box, and the simulation receives its outputs."""
+"""The simulated box of ``port: simulated``, whose outputs the simulation receives."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ class SimulatedAccess:
         self.box: ModelBox | None = None
 
     def connect(self) -> Port:
-        """Turn a new box on; returns its serial port, open."""
+        """Turn a new box on, and return its open serial port."""
         self.box = self._new_box()
         return self.box.port
 
     def disconnect(self) -> None:
-        """Turn the box off; no effect if there is none."""
+        """Turn the box off. No effect if there is none."""
         box, self.box = self.box, None
         if box is not None:
             box.close()
@@ -56,7 +56,7 @@ class SimulatedAccess:
             self._simulation.play("lines", program, self._clock.now())
 
     def fired(self, program: LineProgram | None) -> None:
-        """The driver has fired a program: pass what the outputs did to the simulation."""
+        """Pass the outputs of a fired program to the simulation."""
         edges = self._connected().played()
         if program is not None:
             self.lines_set(as_played(edges, program, self._specs))
@@ -78,7 +78,7 @@ class SimulatedAccess:
         return self.max_wait_s
 
     def raise_go(self, timeout_s: float) -> float:
-        """Play the leader: load atoms if there are none, then raise `go`.
+        """Play the leader, who loads atoms if there are none, then raises `go`.
 
         Returns:
             How long to wait for the box, in seconds.
@@ -98,7 +98,7 @@ class SimulatedAccess:
 
 
 def as_played(edges: Sequence[Edge], program: LineProgram, specs: Sequence[LineSpec]) -> LineProgram:
-    """The played edges as a program, in ticks since the first; those that changed nothing are left out."""
+    """The played edges as a program, in ticks since the first, without edges that changed nothing."""
     bits = [mask_of([True], [spec]) for spec in specs]  # other outputs may belong to a leader
     edges = [(tick, mask & sum(bits)) for tick, mask in edges]
     changes = [edge for i, edge in enumerate(edges) if i == 0 or edge[1] != edges[i - 1][1]]

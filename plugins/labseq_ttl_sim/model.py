@@ -1,4 +1,4 @@
-"""A model of the box: the same answers to the same lines, without its firmware.
+"""A model of the box with the same answers to the same lines, without its firmware.
 
 It plays a program in no time at all, from its command or the edge at the start input on, and answers at once.
 """
@@ -44,7 +44,7 @@ class RefusedError(Exception):
 
 
 def numbers(words: list[str], *most: int) -> list[int]:
-    """Read hexadecimal numbers and check their upper limits; each bit of a mask must be an output."""
+    """Read hexadecimal numbers and check their upper limits. Each bit of a mask must be an output."""
     if len(words) != len(most):
         raise RefusedError("arguments")
     read: list[int] = []
@@ -66,7 +66,7 @@ class LeaderInput:
         signals: Outputs that are on for the leader.
         n_go_signals: Edges that were taken.
         more_came: Whether an edge came that could not be taken.
-        level: Level of the input; it is pulled up.
+        level: Level of the input, which is pulled up.
     """
 
     def __init__(self) -> None:
@@ -77,7 +77,7 @@ class LeaderInput:
         self._busy = self._ready = self._failed = 0
 
     def begin(self, busy: int, ready: int, failed: int) -> None:
-        """Accept edges from now on; earlier ones do not count."""
+        """Accept edges from now on. Earlier edges do not count."""
         self._busy, self._ready, self._failed = busy, ready, failed
         self.state, self.signals, self.more_came = IDLE, 0, False
 
@@ -88,7 +88,7 @@ class LeaderInput:
         self.state, self.more_came = DEAF, False
 
     def rise(self) -> bool:
-        """The input rises; returns whether that is a `go`."""
+        """Raise the input, and return whether that is a `go`."""
         self.level = 1
         self.more_came = self.state in (OWED, LATE)
         if self.state != IDLE:
@@ -103,7 +103,7 @@ class LeaderInput:
             self.state, self.signals = LATE, self._busy | self._failed
 
     def answer(self, *, is_ready: bool) -> str:
-        """Send the leader the result of its `go`; returns the box's answer."""
+        """Send the leader the result of its `go`, and return the box's answer."""
         said = f"{self.state:02x} {self.more_came:02x}"
         self.signals = self._ready if is_ready and self.state != LATE else self._failed
         self.state, self.more_came = IDLE, False
@@ -111,10 +111,10 @@ class LeaderInput:
 
 
 class ModelBox:
-    """A box in this process; it is its own serial port too.
+    """A box in this process, which is its own serial port too.
 
     Attributes:
-        on: What is on: bit n is channel n.
+        on: Channels that are on, bit n for channel n.
     """
 
     def __init__(self) -> None:
@@ -136,7 +136,7 @@ class ModelBox:
             "timeout": (partial(setattr, self, "_timeout_ms"), (0xFFFF,)),
             "polarity": (partial(setattr, self, "_polarity"), (OUTPUTS,)),
             "serial": (partial(setattr, self, "_serial"), (0xFFFF,)),
-        }  # with the upper limits of their arguments; None: they are not looked at. The model has no clock
+        }  # with the upper limits of their arguments, None for unchecked ones. The model has no clock
         self._out = bytearray()
         self._polarity = self._serial = 0
         self._boots = -1  # as an erased memory counts
@@ -147,7 +147,7 @@ class ModelBox:
 
     @property
     def signals(self) -> int:
-        """Outputs that are on for a leader, in addition to those of the lines."""
+        """Outputs that are on for a leader, in addition to the outputs of the lines."""
         return self._leader.signals
 
     @property
@@ -184,7 +184,7 @@ class ModelBox:
         """Nothing is open."""
 
     def played(self) -> list[Edge]:
-        """Edges of the last program: ticks since the first, and what was on from then on."""
+        """Edges of the last program, with ticks since the first, and the channels on from then on."""
         return self._edges
 
     def reset(self, after_ticks: int | None = None) -> None:
@@ -194,7 +194,7 @@ class ModelBox:
             self._boot(RESET_INPUT)
 
     def start(self) -> None:
-        """A rising edge at the start input: the start of a program that waits for it, or a leader's `go`."""
+        """A rising edge at the start input, which starts a waiting program, or is a leader's `go`."""
         if self._waits:
             self._leader.level = 1
             self._play()
@@ -206,7 +206,7 @@ class ModelBox:
         self._leader.level = 0
 
     def pass_deadline(self) -> None:
-        """Let the deadline of a leader pass; the model has no clock."""
+        """Let the deadline of a leader pass. The model has no clock."""
         self._leader.pass_deadline()
 
     def unplug(self) -> None:
@@ -342,7 +342,7 @@ class ModelBox:
         self._waits = False
 
     def _play(self) -> None:
-        """Play the armed program; a reset that is due in its middle ends it."""
+        """Play the armed program. A reset that is due in its middle ends it."""
         assert self._armed is not None
         edges, self._armed = self._slots[self._armed], None
         until, self._reset_after = self._reset_after, None
