@@ -106,7 +106,7 @@ def test_a_software_trigger_during_the_read_out() -> None:
         lab.camera.arm(2, 0.01, "software")
         lab.camera.trigger()
         lab.clock.sleep(0.0101)
-        with pytest.raises(DeviceError, match="still reads the last frame"):
+        with pytest.raises(DeviceError, match="cannot take a trigger while it reads a frame"):
             lab.camera.trigger()
 
 

@@ -181,7 +181,7 @@ def test_files_of_another_size_are_found_before_anything_is_played(tmp_path: Pat
         Image.fromarray(pixels(height)).save(tmp_path / f"x{i}.png")
         tifffile.imwrite(tmp_path / f"x{i}.tif", pixels(height))
     for kind in ("png", "tif"):
-        text = f"x2.{kind}: its frames have 5 x 6 pixels, those of x0.{kind} 4 x 6"
+        text = f"x2.{kind}: its frames have 5 x 6 pixels, but x0.{kind} has 4 x 6"
         assert text in refusal(tmp_path / f"*.{kind}")
 
 

@@ -195,7 +195,7 @@ def test_a_board_that_is_unplugged_is_an_error_of_every_call() -> None:
 @pytest.mark.parametrize(
     ("clock", "text"),
     [
-        ("500 MHz", "faster than that of the 'model', PB24-100-4k"),
+        ("500 MHz", "faster than the clock of 'model', PB24-100-4k"),
         ("20 MHz", "is the board a PB24-"),
     ],
 )
@@ -347,9 +347,9 @@ def test_a_run_with_a_simulated_board_fills_as_one_with_virtual_lines(
 @pytest.mark.parametrize(
     ("fault", "text"),
     [
-        ("missing: true", "there is no board 0: SpinAPI finds no board; look at the cable"),
+        ("missing: true", "there is no board 0, since SpinAPI finds no board; look at the cable"),
         ("in_use: true", "the board cannot be opened; another program may use it"),
-        ("clock: 500 MHz", "the board's clock is faster than that of the 'model', PB24-100-4k"),
+        ("clock: 500 MHz", "the board's clock is faster than the clock of 'model', PB24-100-4k"),
     ],
 )
 def test_labseq_devices_finds_what_is_wrong(

@@ -238,7 +238,7 @@ def test_the_serial_number_chooses_the_camera() -> None:
         ({"region": {"height": 8, "width": 10}}, LimitError, "width is 10; the limit is 4 to 128, in steps"),
         ({"binning": 3, "region": {"height": 96, "width": 96}}, DeviceError, "binned by 2 x 2, not what"),
         ({"readout_mode": "quiet"}, DeviceError, "'quiet', which this camera does not have; it has.*slow"),
-        ({"cooling": {"temperature": "-70 degC"}}, DeviceError, "-70 degC; the camera cools to -35 degC"),
+        ({"cooling": {"temperature": "-70 degC"}}, DeviceError, "-70 degC, but the camera cools to -35 degC"),
     ],
 )
 def test_what_the_camera_cannot_do_is_refused_when_it_is_opened(

@@ -59,7 +59,7 @@ a:
         ),
         ("COM3", "socket://localhost:99999", "3:9: 'socket://localhost:99999' is not a port; expected"),
         ('"\\r"', "'\\r'", "4:20: '\\r' holds a backslash; expected control characters"),
-        ("OUT 0,", "ÖUT 0,", "8:17: 'ÖUT 0' is not ascii; expected another 'encoding', or other characters"),
+        ("OUT 0,", "ÖUT 0,", "8:17: 'ÖUT 0' is not ascii; use another 'encoding', or other characters"),
         ("OUT 0,", '"OUT 0\\r",', "8:17: 'OUT 0\\r' contains the end of a command; leave it out"),
         # templates and their arguments
         (
@@ -84,7 +84,7 @@ a:
             "12:29: '1 mm' is a length, not a frequency; expected a frequency",
         ),
         (", max: 200 MHz", "", "12:12: 'max' is missing; expected both limits of a number that is sent"),
-        ("unit: MHz", "unit: Mhz", "12:19: labseq knows no unit 'Mhz'; expected another one; did you mean"),
+        ("unit: MHz", "unit: Mhz", "12:19: labseq knows no unit 'Mhz'; did you mean"),
         ("min: 0, max: 15", "min: 0.2, max: 0.7", "13:29: there is no whole number within the limits"),
         ("type: int, min: 0, max: 15", "type: text, max: 3", "13:25: 'max' is not for type text; exp"),
         ("words: [OFF, ON]", "max: 3", "16:38: 'max' is not for type bool; expected type float or int"),

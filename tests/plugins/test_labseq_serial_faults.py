@@ -102,7 +102,7 @@ def test_a_wrong_baud_rate_is_suspected(simulator: Simulator) -> None:
 def test_another_instrument_is_refused(simulator: Simulator) -> None:
     identify = {"ask": "*IDN?", "reply": "THORLABS SC10.*"}
     device = SerialDevice(settings(port=simulator.port, identify=identify), Context("synth"))
-    with pytest.raises(DeviceError, match=r"'LAB,SIMULATOR,0042,1.7'; expected 'THORLABS SC10.*'"):
+    with pytest.raises(DeviceError, match=r"'LAB,SIMULATOR,0042,1.7', not 'THORLABS SC10.*'"):
         device.open()
     assert {*simulator.log} == {"*IDN?"}, "it was sent nothing else"
 

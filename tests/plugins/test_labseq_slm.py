@@ -156,7 +156,7 @@ def test_the_liquid_crystal_follows_slowly_and_off_leaves_no_tweezer() -> None:
     at_once, soon = (panel.powers(after_s).mean() for after_s in (0.0, 8e-3))
     assert at_once < 0.1
     assert at_once < soon < 0.9 * powers(tweezers).mean()
-    with pytest.raises(DeviceError, match=r"got uint8 of shape \(256, 255\); expected uint8 of \(256, 256\)"):
+    with pytest.raises(DeviceError, match=r"got uint8 of shape \(256, 255\), not uint8 of \(256, 256\)"):
         panel.show(np.zeros((256, 255), np.uint8))
     tweezers.safe_state()
     assert powers(tweezers).max() < 0.1
@@ -289,7 +289,7 @@ def test_a_display_receives_the_grey_levels_and_its_faults_are_named(monkeypatch
     assert not screen.is_open
     with pytest.raises(DeviceError, match=r"cannot open display 2: .* only 2 displays"):
         made(output="display", display=2).open()
-    with pytest.raises(DeviceError, match=r"display 1 has 256 x 256 pixels; expected 256 x 300"):
+    with pytest.raises(DeviceError, match=r"display 1 has 256 x 256 pixels, but `pixels` says 256 x 300"):
         made(output="display", pixels=[256, 300]).open()
 
 

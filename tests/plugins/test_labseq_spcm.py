@@ -372,7 +372,7 @@ def test_a_hot_card_is_reported(driver: Any, place: str, text: str) -> None:
         if not place:
             lab.tweezers.self_test()
             return
-        with pytest.raises(DeviceError, match=f"{text} has 81 degrees Celsius; expected at most 80"):
+        with pytest.raises(DeviceError, match=f"{text} is at 81 degrees Celsius, above the limit of 80"):
             lab.tweezers.self_test()
 
 

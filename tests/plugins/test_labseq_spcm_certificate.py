@@ -72,14 +72,18 @@ def edited(certify: Certify) -> None:
         (
             lambda _: None,
             {},
-            "there is none of the card 12345; mode: sequence is used instead",
+            "there is none for the card 12345; `mode: sequence` is used instead",
         ),
-        (lambda certify: certify(), {"serial": 0}, "`serial` does not say which card it is; mode: sequence"),
-        (lambda certify: certify(stream=False), {}, "says: the card copies samples; mode: sequence"),
+        (
+            lambda certify: certify(),
+            {"serial": 0},
+            "`serial` does not say which card it is; `mode: sequence`",
+        ),
+        (lambda certify: certify(stream=False), {}, "says: the card copies samples; `mode: sequence`"),
         (
             lambda certify: certify(),
             {"sample_rate": 280e6},
-            "sample_rate 250 MHz; the profile has 280 MHz",
+            "sample_rate 250 MHz, but the profile has 280 MHz",
         ),
         (other_computer, {}, "measured on another computer, 'elsewhere'"),
         (edited, {}, "its digest does not match"),

@@ -46,7 +46,7 @@ class TestCards:
     def test_that_are_unknown_are_named_with_the_drivers_reason(self, driver: Any) -> None:
         with driver():  # so that there is a driver library
             tweezers = SpcmMobileTweezers(SpcmSettings(card="simulated-none"), context())
-            with pytest.raises(DeviceError, match=r"'simulated-none': .*no such card; see its name"):
+            with pytest.raises(DeviceError, match=r"'simulated-none': .*no such card; look up its name"):
                 tweezers.open()
 
     def test_in_use_are_named_and_not_disturbed(self, driver: Any) -> None:
@@ -65,7 +65,7 @@ class TestCards:
 
     def test_that_are_too_slow_are_refused(self, driver: Any) -> None:
         slow = replace(M4I6631, name="M4i.6622-x8", sample_rate_hz=(50e6, 625e6))
-        text = r"M4i\.6622-x8 makes 50 to 625 MS/s; sample_rate is 1000 MHz"
+        text = r"M4i\.6622-x8 makes 50 to 625 MS/s, but sample_rate is 1000 MHz"
         with pytest.raises(DeviceError, match=text), driver(model=slow, sample_rate=1e9):
             pass
 
@@ -152,7 +152,7 @@ def test_a_program_longer_than_the_memory_is_refused(driver: Any) -> None:
     small = replace(M4I6631, memory_samples=2 * 2**16)
     with (
         driver(model=small) as lab,
-        pytest.raises(LimitError, match="the card's memory; use mode: fifo"),
+        pytest.raises(LimitError, match=r"\(the card's memory\); use `mode: fifo`"),
     ):
         lab.tweezers.prepare(lab.program())
 
@@ -322,11 +322,11 @@ def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
         ("mode: stream, look_ahead: 0.1 ms", 2, "look_ahead is 100 us; expected at least 184"),
         ("mode: stream, notify_size: 5000", 2, "notify_size is 5000; expected a power of two"),
         ("mode: stream, card_buffer: 65536", 2, "at least twice notify_size, 131072"),
-        (f"mode: stream}}{LINE[:-1]}", 2, "a line triggers it, but mode: stream"),
+        (f"mode: stream}}{LINE[:-1]}", 2, "a line triggers it, but `mode: stream`"),
         (
             "mode: replay, keep_warm: {row_frequency: 82 MHz, column_frequency: 118 MHz}",
             2,
-            "keep_warm is set, but mode: replay leaves the AODs dark",
+            "keep_warm is set, but `mode: replay` leaves the AODs dark",
         ),
         ("rf: {full_scale: 3 V}", 2, "rf.full_scale is 3 V; .* 80 mV"),
     ],

@@ -47,7 +47,9 @@ class TestStartOfAStream:
         with driver(mode, model=replace(M4I6631)) as lab:
             lab.card._machine.model = stuck
             start_s = lab.clock.now()
-            with pytest.raises(DeviceTimeoutError, match=rf"{text}, and was not started; use mode: sequence"):
+            with pytest.raises(
+                DeviceTimeoutError, match=rf"{text}, and was not started; use `mode: sequence`"
+            ):
                 lab.play(lab.program(1))
             assert lab.clock.now() - start_s < 1.1
 
@@ -156,10 +158,10 @@ class TestReferenceClock:
             (
                 624e6,
                 10e6,
-                "the nearest multiples are 620 MHz and 630 MHz; set sample_rate: 640 MHz, which also",
+                "(nearest multiples: 620 MHz, 630 MHz); set sample_rate: 640 MHz, which also",
             ),
             (625e6, 10e6, "set sample_rate: 640 MHz"),
-            (624e6, 100e6, "the nearest multiples are 600 MHz and 700 MHz; set sample_rate: 600 MHz"),
+            (624e6, 100e6, "(nearest multiples: 600 MHz, 700 MHz); set sample_rate: 600 MHz"),
             (640e6, 10e6, ""),
             (624e6, None, ""),
         ],

@@ -108,15 +108,15 @@ class TestAmplitude:
         (
             replace(M4I6631, name="M5i.6357-x16", card_type=0xA6357),
             {},
-            "does not know its steps of memory, amplifiers and delays",
+            "whose steps of memory, amplifiers and delays labseq does not know",
         ),
         (
             replace(M4I6622, name="M4i.9622-x8", card_type=0x79622, modes=r.SPC_REP_STD_DDS),
             {},
             "M4i.9622-x8 cannot play samples as it is .* option AWG and its firmware",
         ),
-        (M4I6621, {"named": "M4i.6631-x8"}, "is a M4i.6621-x8; the profile has model: M4i.6631-x8"),
-        (M4I6631, {"named": "M4i.6621-x8"}, "is a M4i.6631-x8; the profile has model: M4i.6621-x8"),
+        (M4I6621, {"named": "M4i.6631-x8"}, "is a M4i.6621-x8, but `model` is M4i.6631-x8"),
+        (M4I6631, {"named": "M4i.6621-x8"}, "is a M4i.6631-x8, but `model` is M4i.6621-x8"),
         (M4I6621, {"sample_rate": 640e6}, "makes 50 to 625 MS/s; sample_rate is 640 MHz"),
     ],
 )

@@ -105,7 +105,7 @@ class TestPrograms:
 
     def test_longer_than_the_memory_are_refused_before_anything_plays(self, driver: Any) -> None:
         small = replace(M4I6631, memory_samples=2 * 2**16)
-        text = "the card's memory; use mode: fifo"
+        text = r"\(the card's memory\); use `mode: fifo`"
         with driver("sequence", model=small) as lab, pytest.raises(LimitError, match=text):
             lab.tweezers.prepare(lab.program(4))
 

@@ -223,8 +223,8 @@ class Other(ModelBox):
 @pytest.mark.parametrize(
     ("says", "text"),
     [
-        ("shutter 01 0000 0000 01", "'shutter 01 0000 0000 01' answers; expected 'labseq-ttl'"),
-        ("labseq-ttl 03 0000 0000 01", "has version 3 of the protocol; expected 2"),
+        ("shutter 01 0000 0000 01", "'shutter 01 0000 0000 01' answers, not 'labseq-ttl'"),
+        ("labseq-ttl 03 0000 0000 01", "has version 3 of the protocol, not 2"),
         ("labseq-ttl 02 what", "the box answers 'what'; expected 3 hexadecimal numbers"),
     ],
 )

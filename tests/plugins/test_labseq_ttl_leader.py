@@ -246,7 +246,7 @@ def test_a_go_that_came_too_early_has_failed_and_the_next_counts() -> None:
     made = NoLeader()
     made.box.start()
     made.box.pass_deadline()
-    with pytest.raises(DeviceTimeoutError, match=r"no rising edge .* within 100 ms; it is high"):
+    with pytest.raises(DeviceTimeoutError, match=r"no rising edge .* within 100 ms \(it is high"):
         made.lines.wait_for("go", 0.1)
     assert "no step waited for `go`" in made.lines.new_events()[-1]
     assert made.box.signals == 1 << FAILED
