@@ -50,10 +50,10 @@ def test_another_program_has_the_camera() -> None:
 
 
 def test_another_camera_answers() -> None:
-    assert "10001; expected 4711" in refusal(unopened(serial=4711))
+    assert "10001, not 4711" in refusal(unopened(serial=4711))
     lab = unopened(model="DU-888")
     lab.sim.head = IXON_897
-    assert re.search("DU-897; expected .*DU-888", refusal(lab))
+    assert re.search("DU-897, but .*DU-888", refusal(lab))
 
 
 def two_cameras(**settings: Any) -> tuple[Rig, SimulatedCamera]:
@@ -67,7 +67,7 @@ def test_with_two_cameras_the_serial_number_decides() -> None:
     lab, _ = two_cameras()
     assert re.search("2 Andor cameras .*`serial`", refusal(lab))
     lab, _ = two_cameras(serial=4711)
-    assert "10001 and 10002; expected 4711" in refusal(lab)
+    assert "10001 and 10002, not 4711" in refusal(lab)
     lab, _ = two_cameras(serial=10002)
     lab.camera.open()
     assert lab.camera.describe()["model"] == "DU-888"

@@ -144,7 +144,7 @@ def test_packed_formats_and_short_frames_are_refused() -> None:
     memory = ctypes.create_string_buffer(24)
     with pytest.raises(PixelFormatError, match=r"0x010C0006; expected Mono8"):
         unpacked(ctypes.addressof(memory), 24, 0x010C0006, (4, 4))
-    with pytest.raises(AravisError, match="has 24 bytes; expected 32"):
+    with pytest.raises(AravisError, match="has 24 bytes, not 32"):
         unpacked(ctypes.addressof(memory), 24, MONO["Mono16"], (4, 4))
 
 

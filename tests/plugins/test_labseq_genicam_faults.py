@@ -42,8 +42,8 @@ def opening(**settings: Any) -> DeviceError | LimitError:
     [
         ({"camera": "127.255.0.9"}, "check its cable, power and network address"),
         ({"faults": {"busy": True}}, "another program controls it"),
-        ({"model": "BFS-1"}, "the model Simulated; expected BFS-1"),
-        ({"serial": "7"}, "the serial number SIM1; expected 7"),
+        ({"model": "BFS-1"}, "the model Simulated, not BFS-1"),
+        ({"serial": "7"}, "the serial number SIM1, not 7"),
         ({"pixel_format": "Mono14"}, "cannot be Mono14; the camera offers Mono8, Mono10"),
         ({"gain": 2000.0}, "gain is 2000; the limit is 0 to 1000"),
         ({"binning": 16}, "binning is 16; the limit is 1 to 8, in steps of 1"),
@@ -210,7 +210,7 @@ def test_a_camera_that_reads_another_region_is_noticed() -> None:
     with rig(region={"y": 0, "x": 0, "height": 32, "width": 32}) as lab:
         lab.genicam.set("OffsetX", 5)
         lab.camera.arm(1, 0.01, "software")
-        with pytest.raises(DeviceError, match=r"the camera reads .*\(0, 5, 32, 32, .*\); expected"):
+        with pytest.raises(DeviceError, match=r"the camera reads .*\(0, 5, 32, 32, .*\), not"):
             lab.camera.trigger()
 
 

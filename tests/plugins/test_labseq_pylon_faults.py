@@ -115,7 +115,7 @@ def test_the_trigger_line_is_that_of_the_settings() -> None:
         ({"binning": 8}, "binning is 8; the limit is 1 to 4, in steps of 1"),
         ({"gain": 60.0}, "gain is 60; the limit is 0 to 48"),
         ({"gain_raw": 100}, "gain_raw is 100; the limit is 192 to 1023"),
-        ({"model": "acA1920-40um"}, "has the model Emulation; expected acA1920-40um"),
+        ({"model": "acA1920-40um"}, "has the model Emulation, not acA1920-40um"),
     ],
 )
 def test_what_the_camera_is_not_or_cannot_is_refused_when_it_is_opened(

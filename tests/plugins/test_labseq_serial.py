@@ -78,7 +78,7 @@ def test_commands_and_values_cross_the_line_in_the_units_of_the_instrument(simul
             synth.command("toggle_on")
             assert synth.read("is_open") is True
         assert simulator.log.count("TOGGLE") == n_sent + 1
-        text = "synth: never: 'OPEN' was sent, .* is_open is true; expected false"
+        text = "synth: never: 'OPEN' was sent, .* is_open is true, not false"
         with pytest.raises(DeviceError, match=text):
             synth.command("never")
 

@@ -60,7 +60,7 @@ def link_of(rig: Rig) -> Any:
         ("speed=1", {"column_gain": 70.0}, "70 dB; channel 1 has 0 to 60 dB"),
         ("speed=1", {"antenna": "RX2"}, "there is no antenna RX2"),
         ("fault=inactive", {}, r"starting the stream: STREAM_ERROR \(-2\)"),
-        ("detune=13000", {}, "local oscillator to 100028000 Hz; expected 100015000 Hz"),
+        ("detune=13000", {}, "local oscillator to 100028000 Hz, not 100015000 Hz"),
     ],
 )
 def test_a_wrong_radio_is_refused_with_what_is_wrong_and_stays_off(

@@ -386,7 +386,7 @@ def test_a_card_with_its_recovery_firmware_is_reported(driver: Any) -> None:
 def test_a_clock_that_another_program_has_changed_is_reported(driver: Any) -> None:
     with driver() as lab:
         lab.card.write(20000, 100_000_000)
-        with pytest.raises(DeviceError, match="100 MHz; expected 250 MHz"):
+        with pytest.raises(DeviceError, match="100 MHz, but it was set to 250 MHz"):
             lab.tweezers.self_test()
 
 

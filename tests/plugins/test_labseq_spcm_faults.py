@@ -312,7 +312,7 @@ def test_a_cable_with_no_edge_or_two_ends_the_run_with_the_outputs_off(
 @pytest.mark.parametrize(
     ("mobile", "exit_code", "text"),
     [
-        ("serial: 99", 3, "12345; expected 99"),
+        ("serial: 99", 3, "12345, not 99"),
         ("sample_rate: 755 MHz", 2, "p.yaml:6:60: sample_rate: .* gap"),
         ("sample_rate: 150 MHz", 2, "sample_rate is 150 MHz; .* 236 MHz"),
         ("sample_rate: .nan", 2, "p.yaml:6:60: sample_rate is .nan; expected a finite"),

@@ -225,7 +225,7 @@ class Other(ModelBox):
     [
         ("shutter 01 0000 0000 01", "'shutter 01 0000 0000 01' answers, not 'labseq-ttl'"),
         ("labseq-ttl 03 0000 0000 01", "has version 3 of the protocol, not 2"),
-        ("labseq-ttl 02 what", "the box answers 'what'; expected 3 hexadecimal numbers"),
+        ("labseq-ttl 02 what", "the box answers 'what', not 3 hexadecimal numbers"),
     ],
 )
 def test_something_else_at_the_port_is_refused(monkeypatch: pytest.MonkeyPatch, says: str, text: str) -> None:
@@ -449,7 +449,7 @@ def test_the_command_gives_a_box_its_serial_number(
     assert main([plugged.name]) == 0
     said = capsys.readouterr().out
     assert all(fact in said for fact in ("serial number 12", "started 0 times", "active low: none"))
-    with pytest.raises(DeviceError, match="serial number 12; expected 7"):
+    with pytest.raises(DeviceError, match="serial number 12, not 7"):
         make_rig(port=plugged.name, serial_number=7).lines.open()
     with rig(port=plugged.name, serial_number=12) as lab:
         works(lab)
