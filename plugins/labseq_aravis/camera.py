@@ -81,7 +81,7 @@ def camera_id(name: str | None) -> str:
     """The id by which the library opens a camera.
 
     Args:
-        name: IP address, id or serial number of the camera; None for the only one.
+        name: IP address, id or serial number of the camera, None for the only one.
     """
     if name is not None and _is_address(name):
         return name  # opened without a search, which also reaches cameras behind a router
@@ -113,7 +113,7 @@ class Camera:
     feature, refuses the value, or does not answer. Values out of a feature's range are refused.
 
     Args:
-        name: IP address, id or serial number; None for the only camera there is.
+        name: IP address, id or serial number, None for the only camera there is.
 
     Attributes:
         is_ethernet: Whether it is a GigE camera.

@@ -276,7 +276,7 @@ def png_source(files: Sequence[Path]) -> Source:
     """One frame from each PNG file, 8 or 16 bit gray, read with Pillow.
 
     Args:
-        files: In order; at least one.
+        files: In order, at least one.
 
     Raises:
         BadFramesError: A file is not a PNG, not gray, or of another size.

@@ -134,7 +134,7 @@ class AravisConnection(Connection):
         return self._open(self._settings.camera)
 
     def _open(self, camera: str | None) -> Nodes:
-        """Open a camera by its IP address, id or serial number; None for the only one."""
+        """Open a camera by its IP address, id or serial number, None for the only one."""
         self._is_gone = False
         with translated_errors(self._name, "open the camera"):
             self.camera = opened = Camera(camera)
@@ -300,10 +300,10 @@ class AravisConnection(Connection):
 
 
 class FrameCounter:
-    """Numbers the frames of an acquisition, including those that never came.
+    """Numbers the frames of an acquisition, including missing ones.
 
-    The first frame that comes has the number 0. An incomplete frame is counted as the next one, since its
-    frame id is not reliable.
+    The first frame that arrives has the number 0. An incomplete frame counts as the next one, since its frame
+    id is not reliable.
 
     Example:
         >>> counter = FrameCounter()

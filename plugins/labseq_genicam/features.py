@@ -65,7 +65,7 @@ class Features:
     def find(self, *features: str) -> str:
         """The first of these features that the camera offers now, empty if it offers none.
 
-        The name in the standard comes first, then those of older cameras.
+        The name in the standard comes first, then the names of older cameras.
         """
         with self._doing("read which features it has"):
             return next((feature for feature in features if self._nodes.is_available(feature)), "")

@@ -1,6 +1,6 @@
 """Settings of a camera, in the order of the GenICam Standard Features Naming Convention (SFNC).
 
-The names of older cameras follow those of the standard.
+The names of older cameras follow the standard names.
 """
 
 from __future__ import annotations

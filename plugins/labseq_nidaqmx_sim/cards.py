@@ -44,7 +44,7 @@ class Code(IntEnum):
 TEXTS: Final[Mapping[Code, str]] = {
     Code.RESERVED: "the resource is reserved by another task",
     Code.NO_SUCH_TERMINAL: "there is no such terminal",
-    Code.INVALID_VALUE: "the value of a property is not one that the device supports",
+    Code.INVALID_VALUE: "the device does not support the value of a property",
     Code.INVALID_TASK: "there is no such task",
     Code.NO_SUCH_CHANNEL: "the device has no such physical channel",
     Code.NOT_SUPPORTED: "the device does not have this property",
@@ -55,7 +55,7 @@ TEXTS: Final[Mapping[Code, str]] = {
     Code.NO_CHANNELS: "the task has no channels",
     Code.RUNNING: "the task is running",
     Code.CHANNEL_IN_TASK: "the channel is in the task already",
-    Code.CHANNELS_MISMATCH: "the samples are not those of as many channels as the task has",
+    Code.CHANNELS_MISMATCH: "the samples do not have as many channels as the task",
     Code.NOT_DONE: "the task is not done within the time to wait",
     Code.AO_OUT_OF_RANGE: "a sample exceeds the range of the channel",
     Code.BUFFER_TOO_SMALL: "the buffer has fewer than two samples",

@@ -109,7 +109,7 @@ class Instrument:
             self._clock.sleep(LOOK_S)
 
     def carry_out_all(self, names: Iterable[str]) -> list[LabseqError]:
-        """Carry out commands without arguments, also after one that fails.
+        """Carry out commands without arguments, even after one fails.
 
         Returns:
             The failures.

@@ -66,8 +66,9 @@ class AxisLoop:
 def local_oscillator(axes: Sequence[Floats]) -> float:
     """Frequency for which its leakage and the tones' images are farthest from all tones.
 
-    It is near the middle of the tones. On a comb, a third of the spacing from a tone is best: leakage and
-    images are then a third of the spacing from the nearest tone. At half of it each image would be on a tone.
+    It is near the middle of the tones. On a comb, a third of the spacing from a tone is best, because leakage
+    and images are then a third of the spacing from the nearest tone. At half of it each image would be on a
+    tone.
 
     Args:
         axes: Tones of each axis, in Hz.

@@ -30,7 +30,7 @@ NOT_LOCKED: Final = (
     "; connect the clock that reference_clock names (peak to peak 1 to 3 V as a sine, 0.3 to 3 V as a square "
     "wave), or leave reference_clock out"
 )
-"""What to do where the card's PLL does not lock (levels: manual, technical data, clock)."""
+"""Remedy where the card's PLL does not lock (levels from the manual, technical data, clock)."""
 
 
 class Buffer:

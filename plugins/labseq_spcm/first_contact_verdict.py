@@ -200,7 +200,7 @@ def _refused(settings: SpcmSettings) -> list[str]:
 
 
 def _missing(steps: Sequence[str], outdated: Sequence[str]) -> str:
-    """The steps that a certificate needs, some of which were measured with other settings."""
+    """The steps that a certificate needs. ``outdated`` ones were measured with other settings."""
     named = [f"{step} with an oscilloscope" if step == "overwrite" else step for step in steps]
     text = f"the certificate needs the step{'s' if steps[1:] else ''} {', '.join(named)}"
     was = f" ({', '.join(outdated)} measured with another sample_rate, notify_size or card_buffer)"

@@ -111,8 +111,8 @@ class Fifo(PlayMode):
     and from there to the outputs. Ring and memory are bounded, so a program is rendered about
     ``fill`` ahead. Before the start both are filled, or hold the whole program. First the ring is rendered
     and handed over, and the transfer started. When the card reports its first block the rest follows, except
-    for the last chunk of its memory, of which it may keep a part for itself. The card knows how many samples
-    to play. It stops after them, and reports if it runs dry before.
+    for the last chunk of its memory, since it may keep a part of it for itself. The card knows how many
+    samples to play. It stops after them, and reports if it runs dry before.
     """
 
     max_wait_s = 0.0

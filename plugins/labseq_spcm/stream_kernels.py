@@ -63,7 +63,7 @@ error code."""
 known, and how much the card fetched meanwhile."""
 (HELPER, POSTED, DONE, HELP_AXIS, HELP_START, HELP_OUT) = range(35, 41)
 """Address of the signal for :func:`assist` in another thread, 0 if there is none. Then a part of the column
-axis that waits to be rendered, one that was rendered, and the arguments of RENDER for it."""
+axis that waits to be rendered, a rendered part, and its arguments of RENDER."""
 (LOCK, TIMER) = range(46, 48)
 """Addresses of the lock of the library's calls, 0 where a call itself calls the loop, and of its timer."""
 (IS_FILLING, TO_START, START_COMMAND, NOW_NS, FILLED_BY_NS) = range(41, 46)
@@ -220,8 +220,8 @@ def assist(box: Words, timer: Words, signal: Words) -> None:
 def supply_program(box: Words, room: int) -> int:
     """Copy or render the next part of a piece into the ring. Returns 0 or FAILED.
 
-    A part is at most a quarter of what is ahead of the card, so that it is there long before its time. Only
-    whole blocks are handed over.
+    A part is at most a quarter of the samples ahead of the card, so that it is there long before its time.
+    Only whole blocks are handed over.
     """
     place = box[QUEUE + (box[TAKEN] - 1) % N_QUEUE]
     program = carray(pointer(place), N_PROGRAM, np.int64)

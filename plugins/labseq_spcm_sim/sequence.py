@@ -251,7 +251,7 @@ class Visit:
 class SequenceRun:
     """STD_SEQUENCE, a run from the start step on, after the first trigger.
 
-    The next step is chosen when the samples enter the output FIFO, of which half is in use (manual, "Sequence
+    The next step is chosen when the samples enter the output FIFO, half of it in use (manual, "Sequence
     Mode"), and the status tells the step at the output. The step that follows is the one in the register at
     that time. A further trigger counts for the next step that waits for a trigger, until the detection of
     triggers is disabled (ours).

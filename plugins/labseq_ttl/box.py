@@ -37,7 +37,7 @@ CAUSES: Final = {1: "power-up", 2: "reset input", 4: "supply voltage too low", 8
 
 
 def open_box(name: str, device: str) -> Port:
-    """Open the serial port ``name`` exclusively; ``device`` is for messages."""
+    """Open the serial port ``name`` exclusively. ``device`` is for messages."""
     return open_port(name, device, BAUD_RATE, write_timeout=WRITE_TIMEOUT_S)
 
 

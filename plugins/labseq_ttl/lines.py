@@ -204,7 +204,7 @@ class TtlLines(Lines):
             self._wait_for_box(box, max_wait_s)
 
     def self_test(self) -> None:
-        """Write a program, read it back, and play one that changes no line."""
+        """Write a program, read it back, and play a program that changes no line."""
         box, slot = self._opened(), self._slots.free()
         self._refuse_while_running("tested")
         self._compiled, self._is_armed = None, False
