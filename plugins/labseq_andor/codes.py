@@ -100,7 +100,7 @@ OVERRUN: Final = frozenset({Code.ACQ_BUFFER, Code.ACQ_DOWNFIFO_FULL, Code.SPOOLE
 TEMPERATURE_STATUS: Final = frozenset(code for code in Code if code.name.startswith("TEMP_"))
 """Codes by which ``GetTemperatureF`` tells the status of the cooling."""
 
-_UNPLUGGED: Final = "the camera does not answer any more; look at its power and its cable, then start again"
+_UNPLUGGED: Final = "the camera no longer answers; check its power and cable, then start again"
 _IN_USE: Final = (
     "the camera is there but cannot be used; close Solis and every other program that uses it, and if none "
     "does, switch the camera off and on"

@@ -80,7 +80,7 @@ class AndorConnection:
         with self._translated_errors() as sdk:
             indices = range(sdk.GetAvailableCameras())
         if not indices:
-            text = "no Andor camera is connected; look at its power and its cable, and close Solis"
+            text = "no Andor camera is connected; check its power and cable, and close Solis"
             raise DeviceError(self.name, text)
         if serial == 0 and len(indices) > 1:
             text = f"{len(indices)} Andor cameras are connected; choose one by `serial`"

@@ -33,13 +33,13 @@ TEST_S: Final = 20e-3
 NOT_DONE: Final = -200560
 """NI's code for a task that has not ended within the time to wait."""
 HINTS: Final[Mapping[int, str]] = {
-    -50103: "another program or task uses these outputs; close it",
-    -200022: "another program or task uses these outputs; close it",
-    -201003: "look at the cable and the supply of the card",
-    -88705: "look at the cable and the supply of the card",
+    -50103: "close the other program or task that uses these outputs",
+    -200022: "close the other program or task that uses these outputs",
+    -201003: "check the cable and the supply of the card",
+    -88705: "check the cable and the supply of the card",
     -200621: "lower `rate`, or use a card on PCI Express",
     -200016: "lower `rate`, or use a card on PCI Express",
-    -200303: "digital lines of this card need the clock of an analogue output, so put a line on one",
+    -200303: "put a line on an analogue output, whose clock the digital lines of this card need",
 }
 """NI's code -> remedy."""
 

@@ -195,7 +195,7 @@ class PulseBlasterLines(Lines):
             if number >= n_boards:
                 found = f"boards 0 to {n_boards - 1}" if n_boards else "no board"
                 text = f"there is no board {number}, since SpinAPI finds {found}"
-                raise DeviceError(self._name, f"{text}; look at the cable, or change 'board_number'")
+                raise DeviceError(self._name, f"{text}; check the cable, or change 'board_number'")
             connect(spinapi, number, self._model.clock_hz / 1e6)
             firmware = call(spinapi, "pb_get_firmware_id")
             self._firmware = f"{firmware >> 8 & 0xFF}-{firmware & 0xFF}"

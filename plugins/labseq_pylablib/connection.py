@@ -23,7 +23,7 @@ from labseq_pylablib.settings import PylablibSettings
 BUFFER_BYTES: Final = 2 * 2**30
 """Memory for the frames of a series."""
 
-_UNPLUGGED: Final = "the camera does not answer any more; look at its power and its cable, then start again"
+_UNPLUGGED: Final = "the camera no longer answers; check its power and cable, then start again"
 _TOO_EARLY: Final = "the camera cannot take a trigger yet; read the last frame first"
 MEANINGS: Final[Mapping[str, str]] = {
     "DCAMERR_NOCONNECTION": _UNPLUGGED,
@@ -165,7 +165,7 @@ class Connection(ABC):
         if not places:
             text = f"no {self.settings.interface} camera is connected"
             program = f"close {self.vendor.program}"
-            raise DeviceError(self.name, f"{text}; look at its power and its cable, and {program}")
+            raise DeviceError(self.name, f"{text}; check its power and cable, and {program}")
         if len(places) > 1 and not wanted:
             text = f"{len(places)} cameras are connected; choose one by `serial`"
             raise DeviceError(self.name, text)

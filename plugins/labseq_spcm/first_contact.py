@@ -80,7 +80,7 @@ def _steps(bench: Bench, full_scale: str) -> Iterator[ContactStep]:
     yield step("identity", f"reads what the card is and can do ({OFF})", 10, card.identity)
     yield step("times", f"times resets, starts and transfers ({relays})", 30, card.times)
     yield step("positions", f"hands silence over and reads positions ({OFF})", 20, transfer.positions)
-    yield step("write_speed", f"writes to the card at many notify sizes ({OFF})", 120, transfer.write_speed)
+    yield step("write_speed", f"writes to the card at some notify sizes ({OFF})", 120, transfer.write_speed)
     yield step("lag", f"times reports, also on a busy computer ({OFF})", 60, transfer.lag)
     yield step("sustained", f"plays silence at the sample rate for 1 s ({OFF})", 30, transfer.sustained)
     yield step("starve", f"lets the card run dry, and starts it again ({OFF})", 20, transfer.starve)

@@ -48,7 +48,7 @@ begin. Then the addresses of a block of silence, of room for 2 x CHUNK samples, 
 one."""
 FOUND: Final = 12
 STOP, QUEUED, QUEUE = 13, 14, 15
-"""Written by Python to end the loop, the number of programs so far, and the addresses of the last N_QUEUE."""
+"""Written by Python: whether to end the loop, number of programs, addresses of the last N_QUEUE."""
 N_QUEUE: Final = 4
 PREPARED: Final = 19
 """Written by Python, the address of the program that will be queued next, 0 if there is none."""
@@ -63,7 +63,7 @@ error code."""
 known, and how much the card fetched meanwhile."""
 (HELPER, POSTED, DONE, HELP_AXIS, HELP_START, HELP_OUT) = range(35, 41)
 """Address of the signal for :func:`assist` in another thread, 0 if there is none. Then a part of the column
-axis that waits to be rendered, a rendered part, and its arguments of RENDER."""
+axis that waits to be rendered, a rendered part, and the arguments of RENDER."""
 (LOCK, TIMER) = range(46, 48)
 """Addresses of the lock of the library's calls, 0 where a call itself calls the loop, and of its timer."""
 (IS_FILLING, TO_START, START_COMMAND, NOW_NS, FILLED_BY_NS) = range(41, 46)

@@ -214,7 +214,7 @@ def test_levels_beyond_the_range_of_the_card_are_refused() -> None:
 
 
 def test_a_card_without_a_clock_for_its_lines_takes_that_of_an_analogue_output() -> None:
-    text = r"\(-200303\); digital lines of this card need the clock of an analogue output"
+    text = r"\(-200303\); put a line on an analogue output, whose clock the digital lines"
     with lab(ONE, levels={}, faults={"card": "PCI-6259"}) as here, pytest.raises(DeviceError, match=text):
         here.fire()
     power = LineSpec("power", "Dev1/ao1", ("image",))
@@ -256,7 +256,7 @@ def test_a_card_that_is_unplugged_is_an_error_of_every_call() -> None:
     with lab(faults={"unplugged": True}) as here:
         here.fire()
         for call in (partial(here.lines.wait, 1.0), here.lines.safe_state, here.lines.close):
-            with pytest.raises(DeviceError, match=r"\(-201003\); look at the cable"):
+            with pytest.raises(DeviceError, match=r"\(-201003\); check the cable"):
                 call()
         here.lines.close()
 
@@ -439,7 +439,7 @@ def test_a_run_with_simulated_cards_fills_as_one_with_virtual_lines(
     ("set_to", "text"),
     [
         ("faults.card=USB-6008", "Dev1/ao0 of this USB-6008 has no hardware timing"),
-        ("faults.in_use=true", "another program or task uses these outputs; close it"),
+        ("faults.in_use=true", "close the other program or task that uses these outputs"),
         ("faults.underflow=1ms", "ran out of samples, because the bus was too slow (-200621); lower `rate`"),
     ],
 )

@@ -169,7 +169,7 @@ def test_outputs_that_the_board_does_not_have_are_refused(channel: int | str, mo
 @pytest.mark.parametrize(
     ("faults", "text"),
     [
-        ({"missing": True}, "there is no board 1: SpinAPI finds no board; look at the cable"),
+        ({"missing": True}, "there is no board 1, since SpinAPI finds no board; check the cable"),
         ({"in_use": True}, "SpinAPI: pb_init: the board cannot be opened; another program may use it"),
     ],
 )
@@ -347,7 +347,7 @@ def test_a_run_with_a_simulated_board_fills_as_one_with_virtual_lines(
 @pytest.mark.parametrize(
     ("fault", "text"),
     [
-        ("missing: true", "there is no board 0, since SpinAPI finds no board; look at the cable"),
+        ("missing: true", "there is no board 0, since SpinAPI finds no board; check the cable"),
         ("in_use: true", "the board cannot be opened; another program may use it"),
         ("clock: 500 MHz", "the board's clock is faster than the clock of 'model', PB24-100-4k"),
     ],
