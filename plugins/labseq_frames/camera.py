@@ -29,7 +29,7 @@ class FramesSettings(OrientationSettings):
     )
     images: Literal["all", "first"] = Field(
         default="all",
-        description="of a run, all frames of all shots in order, or only the first image of each shot",
+        description="for a run, all frames of all shots in order, or only the first image of each shot",
     )
     at_end: Literal["stop", "repeat"] = Field(
         default="stop",

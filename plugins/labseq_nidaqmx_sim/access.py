@@ -87,7 +87,7 @@ class Function:
 
 
 def _plain(argument: Any) -> Any:
-    """Numbers and text of arguments, which references point to."""
+    """The number or text of an argument, or of the value that a reference points to."""
     if isinstance(argument, bytes):
         return argument.decode()
     if hasattr(argument, "_obj"):

@@ -96,7 +96,7 @@ class CommandSettings(Settings):
     )
     timeout: PositiveDuration | None = Field(
         default=None,
-        description="how long the reply and the values of `makes` may take, or none for `timeout` above",
+        description="how long the reply and the values of `makes` may take, or none for the usual `timeout`",
     )
     example: str | None = Field(default=None, description="an example of a reply, for dry runs")
 
@@ -202,9 +202,7 @@ class SerialSettings(Settings):
     usb: UsbSettings | None = Field(default=None, description="the adapter, instead of a port")
     baud_rate: int = Field(default=9600, ge=50, le=12_000_000, description="bits per second")
     data_bits: Literal[5, 6, 7, 8] = Field(default=8, description="bits per character")
-    parity: Literal["none", "even", "odd", "mark", "space"] = Field(
-        default="none", description="its parity bit"
-    )
+    parity: Literal["none", "even", "odd", "mark", "space"] = Field(default="none", description="parity bit")
     stop_bits: Literal[1, 2] = Field(default=1, description="bits between characters")
     flow_control: Literal["none", "rts_cts", "dsr_dtr", "xon_xoff"] = Field(
         default="none", description="how the instrument signals that it can take no more"
@@ -215,7 +213,7 @@ class SerialSettings(Settings):
     read_ends_with: Text = Field(
         description='what ends a reply, either a line end or the next prompt, as `"\\r\\n> "`',
     )
-    encoding: Literal["ascii", "latin-1", "utf-8"] = Field(default="ascii", description="of the characters")
+    encoding: Literal["ascii", "latin-1", "utf-8"] = Field(default="ascii", description="text encoding")
     echo: bool = Field(default=False, description="whether the instrument repeats what it is sent")
     timeout: PositiveDuration = Field(default=0.5, description="how long a reply may take")
     retries: int = Field(

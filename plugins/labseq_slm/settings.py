@@ -58,7 +58,7 @@ class SlmSettings(Settings):
         default=(1024, 1272), description="rows and columns of pixels"
     )
     pixel_pitch: PositiveLength = Field(default=12.5e-6, description="distance between neighbouring pixels")
-    wavelength: PositiveLength = Field(default=808e-9, description="of the light")
+    wavelength: PositiveLength = Field(default=808e-9, description="wavelength of the light")
     focal_length: PositiveLength = Field(
         default=15e-3,
         description="effective focal length from the SLM to the atoms, the objective's over the "
@@ -70,7 +70,7 @@ class SlmSettings(Settings):
         description="vector (x, y) from the zeroth order, which receives the light that is not diffracted, "
         "to the middle of the grid, in the atom plane",
     )
-    rotation: Angle = Field(default=0.0, description="of the pixels against the grid, clockwise")
+    rotation: Angle = Field(default=0.0, description="rotation of the pixels against the grid, clockwise")
     mirrored: bool = Field(default=False, description="whether the optics mirror left and right")
     look_up_table: FilePath | None = Field(
         default=None,

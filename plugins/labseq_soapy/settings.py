@@ -37,7 +37,7 @@ class SoapySettings(Settings):
         description="samples per second. The tones may span 80 % of it around the local oscillator",
     )
     bandwidth: Rate | None = Field(
-        default=None, description="of the radio's analog filters, or none to let the radio choose"
+        default=None, description="bandwidth of the analog filters, or none to let the radio choose"
     )
     local_oscillator: Rate | None = Field(
         default=None,
@@ -76,7 +76,7 @@ class SoapySettings(Settings):
     max_disturbances: Annotated[int, Field(ge=0)] = Field(
         default=10,
         description="how often the radio may run out of samples, or miss a packet of them, in a minute while "
-        "the array is on. Each time the shot is repeated. Above this number the run ends",
+        "the array is on. The shot is repeated each time. Above this number the run ends",
     )
     after_run: Literal["off", "on"] = Field(
         default="off",

@@ -141,7 +141,7 @@ class SpcmMobileTweezers(MobileTweezers):
         return math.inf if self._mode is None else self._mode.beginning_s
 
     def warnings(self) -> list[str]:
-        """Warn of a stream without a certificate, and of rates that do not suit the reference clock."""
+        """Warn of a stream without a certificate, and of unsuitable or slowly rendered sample rates."""
         settings, grid = self._settings, self._context.grid
         rate = self._name, settings.sample_rate
         found = limits.reference_warnings(*rate, settings.reference_clock, grid)
@@ -175,8 +175,8 @@ class SpcmMobileTweezers(MobileTweezers):
         """Open the card and set it up, outputs off. No effect if it is open.
 
         Raises:
-            DeviceError: No package or driver library, no such card, another program holds it, another type,
-                it does not take a setting, or the bus or this computer is too slow for ``stream``.
+            DeviceError: No package or driver library, no such card, a card of another type, another program
+                holds it, it refuses a setting, or the bus or this computer is too slow for ``stream``.
             LimitError: This card cannot do the profile's ``rf.full_scale``.
             ConfigError: The certificate of the mode ``stream`` is for another card, driver or firmware.
         """
