@@ -23,8 +23,8 @@ class KeepWarmSettings(Settings):
     column_frequency: Frequency = Field(description="tone of the column axis, likewise")
     amplitude: Annotated[float, Field(gt=0, le=1)] | None = Field(
         default=None,
-        description="part of full scale, on both axes. With none, the mean power of as many tones as the profile "
-        "allows at once",
+        description="part of full scale, on both axes. With none, the mean power of as many tones as the "
+        "profile allows at once",
     )
 
 
@@ -103,8 +103,8 @@ class SpcmSettings(Settings):
     )
     look_ahead: Annotated[Duration, Field(gt=0, le=10e-3)] | None = Field(
         default=None,
-        description="for `stream`, how far ahead of the outputs a program begins, and how long it takes at most "
-        "to reach them. With none, 0.25 ms, or more if the card's buffers hold more at this sample rate",
+        description="for `stream`, how far ahead of the outputs a program begins, and how long it takes at "
+        "most to reach them. With none, 0.25 ms, or more if the card's buffers hold more at this sample rate",
     )
     notify_size: int = Field(
         default=1 << 16,
