@@ -47,7 +47,6 @@ PAGE = DOCS / "develop" / "planner-figures.md"
 PICTURES = DOCS / "_static" / "planners"
 
 PLANNERS = "psca,psca:variant=paper,tetris,mta1,hca,compression,lsap,lsap_squared"
-SIZES = ((20, 15), (30, 22), (64, 48))
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -71,17 +70,7 @@ def planners(n_loadings: int) -> list[str]:
 
 def variants(n_loadings: int) -> list[str]:
     """The generalised PSCA beside the paper's, with what each loses."""
-    header = (
-        "planner",
-        "DOP",
-        "batches",
-        "atoms moved",
-        "distance",
-        "motion",
-        "atoms lost",
-        "defect-free",
-        "to the bound",
-    )
+    header = ("planner", "DOP", "batches", "atoms moved", "motion", "atoms lost", "defect-free")
     return planner_table(header, "psca,psca:variant=paper", "2,7,15", n_loadings)
 
 
@@ -115,22 +104,6 @@ CELLS: Final[Mapping[str, Callable[[Row], str]]] = {
     "to the bound": lambda row: str(row["ratio_to_bound"]),
 }
 """Head of a column -> its cell in a row."""
-
-
-def sizes(n_loadings: int) -> list[str]:
-    """The generalised PSCA in growing arrays."""
-    rows: list[list[str]] = []
-    for grid, side in SIZES:
-        target = f"{{pattern: compact, rows: {side}, cols: {side}}}"
-        comparison = read_comparison(grid=f"{grid}x{grid}", target=target, dop="15", loadings=n_loadings)
-        (row,) = compare(comparison, Resources(1)).rows
-        times = [format_quantity(s, "time") for s in (row["planning_s"]["median"], row["planning_s"]["p99"])]
-        rows.append([f"{grid} x {grid} to {side} x {side}", str(row["n_batches"]), *times])
-    command = 'labseq bench planners --dop 15 --grid 64x64 --target "{pattern: compact, rows: 48, cols: 48}"'
-    return [
-        *shown(f"{command} --loadings {n_loadings} --workers 1"),
-        *markdown(("size", "batches", "planning, median", "99 %"), rows),
-    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -551,7 +524,6 @@ PARTS: Final[Mapping[str, Callable[[int], list[str]]]] = MappingProxyType(
     {
         "planners": planners,
         "variants": variants,
-        "sizes": sizes,
         **{figure.part: partial(figure_lines, figure) for figure in FIGURES.values()},
         "statements": statements,
     }
