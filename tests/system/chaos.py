@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import labseq
+from labseq.session.resume import is_over
 
 from .resumable import SHOTS, check_committed, sequence_of, table
 
@@ -520,8 +521,9 @@ def next_command(bench: Bench, job: str) -> list[str] | None:
         waiting = not runs
     if waiting:
         return JOBS[job]
-    left = [run for run in runs if labseq.open_run(run).status != "complete"]
-    return ["resume", str(left[0])] if left else None
+    # a run that failed after its last shot, because a device was not safe, stays failed
+    left = [run for run in map(labseq.open_run, runs) if run.status != "complete" and not is_over(run)]
+    return ["resume", str(left[0].path)] if left else None
 
 
 def prepare(bench: Bench, job: str) -> None:
