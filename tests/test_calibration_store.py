@@ -116,7 +116,7 @@ def test_a_renamed_or_exchanged_file_is_refused(store: Store) -> None:
     other.path.replace(one.path)
     with pytest.raises(ConfigError, match="it was renamed"):
         store.find(one.entry.id)
-    with pytest.raises(ConfigError, match="was put to use as 'overlay', and this is another"):
+    with pytest.raises(ConfigError, match="was put to use as 'overlay', but this is another"):
         store.entry_in_use("overlay")
 
 

@@ -13,7 +13,7 @@ from labseq.errors import ConfigError
 @pytest.mark.parametrize(
     ("address", "keys", "message"),
     [
-        ("tcp://10.0.0.1:8786", None, "run code; expected tls"),
+        ("tcp://10.0.0.1:8786", None, "run code on the workers; expected tls"),
         (
             "tls://lab:8786",
             None,

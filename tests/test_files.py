@@ -107,7 +107,7 @@ def test_a_write_that_fails_leaves_the_older_file(
             errno.EACCES,
             "has no permission to write there; .*choose another place with --output or LABSEQ_DATA",
         ),
-        (errno.ENOTDIR, "a file is in the way"),
+        (errno.ENOTDIR, "a file is where a folder is needed"),
         (errno.EMFILE, "check the disk"),
     ],
 )
