@@ -102,7 +102,7 @@ class Report:
     """The results of a comparison.
 
     Attributes:
-        rows: A row per condition and planner. None for a condition without any finished loading.
+        rows: A row per condition and planner, without conditions that have no finished loading.
         n_done: Number of finished loadings, over all conditions.
         duration_s: Duration of the comparison, in seconds.
         ended_by: The error that ended it early, or None.

@@ -304,7 +304,7 @@ def _expected(assembly: Assembly, checked: CheckReport, better: str) -> Facts:
         for name in LossSpec.__dataclass_fields__
         if name.removesuffix("_s") not in given
     ]
-    losses = f"{', '.join(guessed)}as in the paper, because the profile does not give them"
+    losses = f"{', '.join(guessed)}: as in the paper, because the profile does not give them"
     return [*([("better", better)] if better else []), *([("losses", losses)] if guessed else [])]
 
 

@@ -87,7 +87,7 @@ class _Terminal:
     def reads(self, reading: Reading, stop: StopFlag) -> float | None:
         """Ask for a reading until it makes sense."""
         example = EXAMPLES[reading.dimension] if reading.dimension != "fraction" else "12"
-        while text := _answer(f"  read {reading.about} (such as {example}, or nothing if not read):  ", stop):
+        while text := _answer(f"  read {reading.about} (such as {example}, or nothing if not read): ", stop):
             try:
                 value = parse_quantity(text, reading.dimension)
             except ValueError as error:

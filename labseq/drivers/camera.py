@@ -402,7 +402,7 @@ class SimulatedSensor:
 
         Args:
             series: Number, length and trigger of the exposures. With the internal trigger the first
-                exposure begins now, and each other at the end of the previous read-out.
+                exposure begins now, and each later one at the end of the previous read-out.
             mode: Region and binning.
             readout_s: From the end of an exposure until its frame can be read, in seconds.
             period_s: With the internal trigger, from one exposure to the next, in seconds. Shorter than

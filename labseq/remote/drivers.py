@@ -59,7 +59,7 @@ class DeviceEntry:
         name: Role of the device, or its name in the profile.
         plugin: Its plugin.
         simulation: Plugin of the simulation on which it acts, if it is simulated.
-        identities: Identifiers of the hardware, for its marker. None if it is simulated.
+        identities: Identifiers of the hardware, for its marker. Empty if it is simulated.
     """
 
     name: str

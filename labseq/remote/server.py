@@ -54,7 +54,7 @@ class Serving:
 
     Attributes:
         address: ``tcp://HOST:PORT`` with the control's port. The devices have the next ports.
-        devices: Roles and names of devices. None for all real devices of the profile, or all if none is real.
+        devices: Roles and names of devices. Empty for all real ones of the profile, or all if none is real.
         plain: Whether to serve without keys, on this computer only.
     """
 
