@@ -42,7 +42,7 @@ def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
         fail_buffers(lab, 2)
         for number in (0, 1):
             lab.camera.trigger()
-            with pytest.raises(TransientError, match=f"frame {number} was lost, of a .* 4: .*incomplete"):
+            with pytest.raises(TransientError, match=f"frame {number} was lost from a .* 4: .*incomplete"):
                 lab.camera.read(1.0)
         for number in (2, 3):
             lab.camera.trigger()
