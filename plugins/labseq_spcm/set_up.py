@@ -67,7 +67,7 @@ def read_model(card: AwgCard, device: str, named: str) -> Model:
         is_fast = code & spcm.TYP_FAMILYMASK == spcm.TYP_M5I63XX_X16 & spcm.TYP_FAMILYMASK
         why = ", whose steps of memory, amplifiers and delays labseq does not know" if is_fast else ""
         text = f"the card '{device}' is a {product} with {n_outputs} outputs{why}"
-        raise DeviceError(card.name, f"{text}; use {FAMILY_NAMES}")
+        raise DeviceError(card.name, f"{text}; name {FAMILY_NAMES} as `card`")
     if n_outputs < 2:
         why = "both axes must be on one card, as labseq does not drive the star-hub that starts two together"
         text = f"the card '{device}' is a {product} with one output, but {why}"

@@ -128,7 +128,7 @@ def test_a_value_beyond_its_limits_or_unreadable_stops_everything(simulator: Sim
         with pytest.raises(DeviceError, match=r"synth: temperature: 'TEMP\?' was answered by 'WHAT'"):
             synth.check_interlocks()
         for value, text in (
-            ("25.60", "25.6 degC; .* 15 degC to 25 degC; look at the chiller"),
+            ("25.60", "25.6 degC, .* 15 degC to 25 degC; look at the chiller"),
             ("9.9e37", "implausible; expected -50 degC to 100 degC"),
         ):
             simulator.order("set", "temperature", value)
@@ -292,7 +292,7 @@ def test_a_value_past_its_interlock_ends_the_run_before_anything_is_done(
 ) -> None:
     session_simulator.order("set", "temperature", "25.60")
     observer = Observer()
-    with pytest.raises(DeviceError, match=r"25.6 degC; .* 15 degC to 25 degC; look at the chiller") as caught:
+    with pytest.raises(DeviceError, match=r"25.6 degC, .* 15 degC to 25 degC; look at the chiller") as caught:
         run(lab(tmp_path, session_simulator.port), observer=observer)
     assert "TOGGLE" not in session_simulator.log
     assert session_simulator.log[-1] == "CLOSE"

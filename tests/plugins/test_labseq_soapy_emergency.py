@@ -104,7 +104,7 @@ def test_a_radio_that_cannot_be_opened_again_may_transmit_and_the_text_says_so(t
     dead.wait()
     opened = tmp_path / "opened"
     opened.write_text(str(dead.pid), "ascii")
-    may_transmit = "'driver=none' .*no match; .*transmitters stay on .*switch it off by hand"
+    may_transmit = "'driver=none' .*no match.* transmitters stay on .*switch it off by hand"
     with pytest.raises(script.EmergencyError, match=may_transmit):
         script.off(dead.pid, 1, str(opened), 0.01, "driver=none", [0, 1], STREAMER)
     assert opened.exists(), "the next attempt tries it again"

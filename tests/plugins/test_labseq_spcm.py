@@ -207,7 +207,7 @@ class TestKeepWarm:
     @pytest.mark.parametrize(
         ("key", "hz", "says"),
         [
-            ("row_frequency", 100e6, "is 100 MHz; the limit is 82 to 82.4 MHz or 117.6 to 118 MHz: within"),
+            ("row_frequency", 100e6, "is 100 MHz; the limit is 82 to 82.4 MHz or 117.6 to 118 MHz, within"),
             ("row_frequency", 83.2e6, "the AOD's band and off the atoms"),
             ("column_frequency", 81e6, "keep_warm.column_frequency is 81 MHz"),
             ("amplitude", 1.0, "mean power of the row axis' keep-warm tone"),

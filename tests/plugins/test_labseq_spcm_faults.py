@@ -52,14 +52,14 @@ class TestCards:
     def test_in_use_are_named_and_not_disturbed(self, driver: Any) -> None:
         with driver() as lab:
             other = SpcmMobileTweezers(lab.settings, context())
-            with pytest.raises(DeviceError, match=r"in use; .*close what else uses it"):
+            with pytest.raises(DeviceError, match=r"in use; .*close other programs"):
                 other.open()
             other.close()
             lab.play(lab.program())
 
     def test_of_another_family_are_refused(self, driver: Any) -> None:
         digitizer = replace(M4I6631, name="M4i.4420-x8", card_type=0x74420)
-        text = r"a M4i\.4420-x8 .* expected a Spectrum M4i\.66xx, .*`card`"
+        text = r"a M4i\.4420-x8 .* name a Spectrum M4i\.66xx, .*`card`"
         with pytest.raises(DeviceError, match=text), driver(model=digitizer):
             pass
 

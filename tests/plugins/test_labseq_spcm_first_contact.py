@@ -321,7 +321,7 @@ class TestMeasuredCard:
 def test_another_model_and_a_card_in_use_are_refused() -> None:
     digitizer = replace(M4I6631, name="M4i.4420-x8", card_type=0x74420)
     with (
-        pytest.raises(DeviceError, match=r"is a M4i\.4420-x8 .*use a Spectrum"),
+        pytest.raises(DeviceError, match=r"is a M4i\.4420-x8 .*name a Spectrum"),
         met(with_faults(model=digitizer)),
     ):
         pass
@@ -329,7 +329,7 @@ def test_another_model_and_a_card_in_use_are_refused() -> None:
         settings = lab.contact._bench.settings
         context = Context("mobile_tweezers", clock=lab.clock)
         other = SpcmMobileTweezers(settings, context).first_contact()
-        with pytest.raises(DeviceError, match=r"in use; .*close what else uses it"):
+        with pytest.raises(DeviceError, match=r"in use; .*close other programs"):
             other.open()
 
 

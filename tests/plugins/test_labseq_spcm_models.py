@@ -103,7 +103,7 @@ class TestAmplitude:
         (
             replace(M4I6631, name="M4i.6630-x8", card_type=0x76630, n_channels=1),
             {},
-            "one output; both axes must be on one card, .* star-hub",
+            "one output, but both axes must be on one card, .* star-hub",
         ),
         (
             replace(M4I6631, name="M5i.6357-x16", card_type=0xA6357),
@@ -117,7 +117,7 @@ class TestAmplitude:
         ),
         (M4I6621, {"named": "M4i.6631-x8"}, "is a M4i.6621-x8, but `model` is M4i.6631-x8"),
         (M4I6631, {"named": "M4i.6621-x8"}, "is a M4i.6631-x8, but `model` is M4i.6621-x8"),
-        (M4I6621, {"sample_rate": 640e6}, "makes 50 to 625 MS/s; sample_rate is 640 MHz"),
+        (M4I6621, {"sample_rate": 640e6}, "makes 50 to 625 MS/s, but sample_rate is 640 MHz"),
     ],
 )
 def test_a_card_that_cannot_do_it_is_refused_with_the_reason(

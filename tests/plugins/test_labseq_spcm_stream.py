@@ -297,7 +297,7 @@ def test_nothing_is_appended_where_nothing_plays_or_a_program_must_be_whole(driv
 def test_a_slot_that_cannot_stream_is_named(driver: Any, pcie: tuple[int, int], text: str) -> None:
     slot = replace(M4I6631, pcie=pcie)
     with (
-        pytest.raises(DeviceError, match=rf"the slot has .*{text} carries 1\.4 GB/s, .* 2\.5 GB/s"),
+        pytest.raises(DeviceError, match=rf"the slot with .*{text} carries 1\.4 GB/s, .* 2\.5 GB/s"),
         driver("stream", model=slot, sample_rate=624e6),
     ):
         pass

@@ -263,7 +263,7 @@ def test_a_go_that_never_comes_is_reported_with_the_level_of_the_input() -> None
     made = NoLeader()
     assert made.lines.new_events() == [HIGH]
     made.box.lower()
-    with pytest.raises(DeviceTimeoutError, match=r"no rising edge .* within 100 ms; it is low;"):
+    with pytest.raises(DeviceTimeoutError, match=r"no rising edge .* within 100 ms \(it is low\);"):
         made.lines.wait_for("go", 0.1)
     made.lines.close()
 
