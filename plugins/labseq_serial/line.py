@@ -192,5 +192,5 @@ def _find(usb: UsbSettings, device: str) -> str:
         names = ", ".join(f"{port.device} ({port.serial_number})" for port in fits)
         text = f"{len(fits)} adapters have {described}: {names}; add 'serial' to tell them apart"
         raise DeviceError(device, text)
-    text = f"no USB adapter has {described}; plug it in, or choose one of {ports_text()}"
+    text = f"no USB adapter has {described}; plug it in, or use {ports_text()}"
     raise DeviceError(device, text)

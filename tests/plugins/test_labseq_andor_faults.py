@@ -152,7 +152,7 @@ def test_a_setting_that_the_camera_does_not_have(chosen: dict[str, Any], text: s
 @pytest.mark.parametrize(
     ("chosen", "text"),
     [
-        ({"em_gain": 301}, "em_gain is 301: above 300 the EM register ages fast.*allow_high_gain: true"),
+        ({"em_gain": 301}, "em_gain is 301, but above 300 the EM register ages fast.*allow_high_gain: true"),
         ({"em_gain": 2, "amplifier": "conventional"}, "conventional amplifier has no EM register"),
         ({"isolated_crop": True}, "isolated_crop needs a `region`"),
         ({"isolated_crop": True, "region": {"height": 8, "width": 8}}, "needs `frame_transfer: true`"),

@@ -190,7 +190,12 @@ def test_wrong_outputs_are_refused(spec: LineSpec, levels: dict[str, float], tex
             DeviceError,
             "no card 'Dev1'; expected a card, but none",
         ),
-        ("Dev1/port0/line0", {"faults": {"in_use": True}}, DeviceError, r"\(-50103\); another program"),
+        (
+            "Dev1/port0/line0",
+            {"faults": {"in_use": True}},
+            DeviceError,
+            r"\(-50103\); close the other program",
+        ),
         ("Dev1/port7/line0", {}, DeviceError, r"no such physical channel.*\(-200170\)"),
         ("Dev1/ao7", {}, DeviceError, r"no such physical channel.*\(-200170\)"),
     ],
