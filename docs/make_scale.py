@@ -147,7 +147,7 @@ def table(results: dict[float, dict[int, dict[str, float]]]) -> list[str]:
     lines = ["| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head))]
     for loading, by_size in results.items():
         for what in by_size[SIZES[0]]:
-            if what.startswith("record") or what.endswith(("tetris", "mta1")):
+            if what.startswith(("record", "check", "tones")) or what.endswith(("tetris", "mta1")):
                 continue
             values = [by_size[n].get(what, np.nan) for n in SIZES]
             unit = 1.0 if what.startswith("batches") else 1e3
