@@ -26,7 +26,7 @@ from labseq_virtual.records import FATES, SITE, plane_of
 from labseq_virtual.settings import SimulationSettings
 from numpy.typing import NDArray
 
-from labseq.model import FrequencyCourse, MotionSpec, SiteGrid
+from labseq.model import MotionSpec, SiteGrid
 
 Floats = NDArray[np.float64]
 
@@ -91,12 +91,8 @@ def results(path: TweezerPath, n_atoms: int) -> list[str]:
     return [f"{100 * loss:.2f}({100 * error:.2f}) %", heating]
 
 
-CONSTANT, JERK = FrequencyCourse.LINEAR, FrequencyCourse.MINIMUM_JERK
-
-
 def landing(
     speed_m_s: float,
-    course: FrequencyCourse = CONSTANT,
     ramp_s: float = MOTION.drop_off_s,
     ends_at: int = 0,
     fades: bool = False,
@@ -105,8 +101,7 @@ def landing(
     """A tweezer that comes from half a site away.
 
     Args:
-        speed_m_s: Mean speed.
-        course: Course of the speed.
+        speed_m_s: Its speed.
         ramp_s: Ramp of the depth after it has arrived.
         ends_at: Where it stops: 0 at the site, 1 half a site before it, -1 half a site behind it.
         fades: Whether the depth goes down evenly on the way instead.
@@ -114,8 +109,7 @@ def landing(
     """
     way = 1 - ends_at
     n = max(1, round(way * HALF_M / speed_m_s / FRAME_S))
-    done = [course.fraction(i / n) for i in range(n + 1)]
-    place = HALF_M * (1 - way * np.array(done))
+    place = HALF_M * (1 - way * np.arange(n + 1) / n)
     depth = 1 - np.arange(n + 1) / n if fades else np.ones(n + 1)
     ramp = depth[-1] * np.linspace(1, 0, round(ramp_s / FRAME_S) + 1)[1:]
     return TweezerPath(
@@ -125,7 +119,6 @@ def landing(
 
 LANDINGS: Final[dict[str, TweezerPath]] = {
     **{f"{v} µm/ms, then the ramp": landing(v * 1e-3) for v in (130, 4)},
-    "minimum jerk, 13 µm/ms on average, then the ramp": landing(13e-3, JERK),
     "13 µm/ms, then a ramp of 300 µs": landing(13e-3, ramp_s=300e-6),
     "130 µm/ms, ramped down on the way": landing(0.13, fades=True),
     "ramped down half a site before": landing(0.13, ends_at=1),
