@@ -26,7 +26,7 @@ Target = Annotated[
     str | None,
     typer.Option(
         metavar="PATTERN|SEQUENCE",
-        help="The target, as in a sequence file, '{pattern: kagome, rows: 15, cols: 15}', or the "
+        help="The target as in a sequence file, '{pattern: kagome, rows: 15, cols: 15}', or the "
         "file or name of a sequence whose target is used. Default: the target that the shot was taken with.",
     ),
 ]

@@ -370,7 +370,11 @@ class PlanReport:
             ("duration", format_quantity(self.duration_s, "time")),
             ("tweezers", f"at most {self.max_tweezers} on at once"),
             ("ejected", plural(self.n_ejected, "atom")),
-            *([("lost", f"{lost}, defect-free {defect_free}")] if self.n_batches else []),
+            *(
+                [("lost", f"{lost}, then defect-free with probability {defect_free}")]
+                if self.n_batches
+                else []
+            ),
             ("filled", f"{count_of(self.n_filled, int(self.target['fill'].sum()))} target sites"),
             *([("surplus", surplus)] if self.n_surplus else []),
         ]

@@ -102,7 +102,7 @@ class BatchFile(Settings):
             what = f"'from' has {len(self.from_sites)} sites, but 'to' has {len(self.to_sites)}"
             raise setting_error(what, "the same number")
         if self.linked and self.tones is not None:
-            raise setting_error("a batch with 'tones' is linked", "linked line batches only")
+            raise setting_error("a batch with 'tones' is linked", "only line batches to be linked")
         return self
 
     def model(self) -> Batch:

@@ -315,8 +315,8 @@ def check_samples_file(path: Path) -> None:
 def save_samples(path: Path, waveform: PlannedWaveform) -> None:
     """Write the samples to a file, which appears only when it is complete.
 
-    ``numpy.load`` then gives ``samples``, int16 (2, n), channel 0 for the row axis, and the first samples of
-    batches and segments, as in :func:`arrays_of`. The samples are rendered and written piece by piece,
+    ``numpy.load`` then gives ``samples``, int16 (2, n), channel 0 for the row axis, and the starts of batches
+    and segments in samples, as in :func:`arrays_of`. The samples are rendered and written piece by piece,
     without compression because samples hardly compress.
 
     Args:
