@@ -90,7 +90,7 @@ def cheapest_shift(atoms: Bools, fill: Bools, row: int, col: int, costs: Costs) 
 
 @helper_kernel()
 def dearest_defect(atoms: Bools, fill: Bools, left: Bools, costs: Costs) -> tuple[int, int]:
-    """Find the defect ``left`` whose shift costs most, or that has none, as row and column or -1.
+    """Find the defect in ``left`` whose shift costs most, or that has no shift, as row and column or -1.
 
     Sites that hold an atom are removed from ``left``.
     """

@@ -34,7 +34,7 @@ def fill_rows(fill: Bools) -> Ints:
 
 @helper_kernel()
 def choose_columns(atoms: Bools, rows: Ints, piled: Ints, chosen: Bools) -> None:
-    """Choose the columns for the atoms of a row, whose next open target row is the uppermost.
+    """Choose the columns with the uppermost open target rows for the atoms of a row.
 
     Among equal columns, columns that already hold an atom of this row come first, then the left columns.
 
