@@ -1,6 +1,6 @@
 """Kernels of the generalised PSCA, which sorts rows to help all columns and compares both orientations.
 
-Its plans have fewer batches than :mod:`labseq_psca.kernels_paper`, which follows the paper's text.
+Its plans have fewer batches than the plans of :mod:`labseq_psca.kernels_paper`, as in the paper's text.
 
 Everything is written for row sorting and then column compression. The other orientation is the same on the
 transposed grid. Names are as in :mod:`labseq_psca.kernels_lines`. ``need``, ``room`` and ``count``, int64
