@@ -184,9 +184,9 @@ def test_a_table_is_read_in_any_order_of_lines(
     ("text", "reason"),
     [
         ("row,col,y\n0,0,1\n", "no column 'x'"),
-        (as_table(PLACES).replace("0,1,", "0,0,"), r"line 3 is of site \(0, 0\), like an earlier line"),
-        (as_table(PLACES) + "3,0,1,1\n", r"line 14 is of site \(3, 0\), which the grid does not have"),
-        ("\n".join(as_table(PLACES).splitlines()[:-2]), r"2 sites are missing, \(2, 2\) among them"),
+        (as_table(PLACES).replace("0,1,", "0,0,"), r"line 3 has site \(0, 0\), like an earlier line"),
+        (as_table(PLACES) + "3,0,1,1\n", r"line 14 has site \(3, 0\), which the grid does not have"),
+        ("\n".join(as_table(PLACES).splitlines()[:-2]), r"2 sites are missing, such as \(2, 2\)"),
         ("row,col,y,x\n0,0,1\n", "line 2 does not have four numbers"),
         ("row,col,y,x\n0,0,one,2\n", "line 2 does not have four numbers"),
         (as_table(np.where(PLACES[1, 1] == PLACES, np.inf, PLACES)), "not all finite"),

@@ -133,7 +133,7 @@ def test_times() -> None:
         ),
         (
             "linked",
-            "moves 1 atoms while 2 are held",
+            "moves 1 atoms but the batch before holds 2",
             "#.#.",
             [batch((0, 0, 0, 1), (0, 2, 0, 3)), batch((0, 1, 0, 0), linked=True)],
             {},

@@ -74,8 +74,8 @@ LANDS = {"empty_tweezers_may_land": True}
     ("rule", "words", "atoms", "moves", "tones", "options"),
     [
         ("shape", "no atom moves", "#..", [], along([1], [2]), {}),
-        ("grid", r"\(0, 7\) lies outside", "#..", [(0, 7, 0, 1)], along([7], [1]), {"eject_slots": 9}),
-        ("grid", "tone 0 goes further than 1 site", "#..", [(0, 0, 0, -2)], along([0], [-2]), {}),
+        ("grid", r"\(0, 7\) is outside", "#..", [(0, 7, 0, 1)], along([7], [1]), {"eject_slots": 9}),
+        ("grid", "tone 0 goes more than 1 site", "#..", [(0, 0, 0, -2)], along([0], [-2]), {}),
         ("source", r"no atom on \(0, 1\)", "#..", [(0, 1, 0, 2)], along([1], [2]), {}),
         ("goal", "ends on an atom that stays", "#.#", [(0, 0, 0, 2)], along([0], [2]), {}),
         ("tones", "no column tone starts at", "#..", [(0, 0, 0, 2)], along([0.5], [2]), {}),

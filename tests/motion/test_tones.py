@@ -282,7 +282,7 @@ def test_the_first_batches_only() -> None:
     assert part.duration_s.tolist() == whole.duration_s[:n].tolist()
     assert part.column.phase_rad.tolist() == whole.column.phase_rad[: part.column.offsets[n]].tolist()
     for wrong in (-1, 4):
-        with pytest.raises(PlanError, match=f"3 batches; {wrong} cannot be played"):
+        with pytest.raises(PlanError, match=f"3 batches, so {wrong} cannot be played"):
             tone_program(plan, GRID, n_batches=wrong)
 
 
