@@ -74,7 +74,7 @@ def test_blank_lines_around_a_drawing_do_not_count() -> None:
 def test_what_is_drawn_is_read(rows: list[list[bool]]) -> None:
     text = "\n".join("".join("#" if site else "." for site in row) for row in rows)
     if not any(map(any, rows)):
-        with pytest.raises(ValueError, match="holds no atom"):
+        with pytest.raises(ValueError, match="has no atom"):
             read_bitmap(text)
     else:
         assert read_bitmap(text).tolist() == rows
@@ -85,7 +85,7 @@ def test_what_is_drawn_is_read(rows: list[list[bool]]) -> None:
     [
         ("", "is empty"),
         ("##\n#\n##", "row 2 of the drawing has 1 characters, but row 1 has 2"),
-        ("..\n..", "holds no atom"),
+        ("..\n..", "has no atom"),
     ],
 )
 def test_a_wrong_drawing_is_a_settings_error(text: str, what: str) -> None:

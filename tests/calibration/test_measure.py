@@ -140,7 +140,7 @@ def test_settings_of_the_detector_count_in_the_analysis(measured: Any, copied: A
     ("kind", "shots", "change", "why"),
     [
         ("sites", 3, "loading=0 %", "no lattice found"),
-        ("thresholds", 30, "loading=0 %", "show one peak"),
+        ("thresholds", 30, "loading=0 %", "show only one peak"),
         ("sites", 2, "image.photoelectrons=200000", "first frame of shot 0 are saturated; use less light"),
     ],
 )

@@ -37,7 +37,7 @@ def test_names_that_a_plugin_cannot_have(name: str, why: str, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("kind", "name", "why"),
     [
-        ("sequence", "a.yaml", "no ending; for example 'a'"),
+        ("sequence", "a.yaml", "without an ending; for example 'a'"),
         ("sequence", "Con", "Windows allows no file of this name"),
         ("sequence", "True", "YAML does not read it as text"),
         ("profile", "virtual", "yours would hide it"),
@@ -72,7 +72,7 @@ def test_what_exists_is_never_written_over(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["plugins", ".labseq"])
 def test_a_file_in_the_way_of_a_folder_is_reported(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text("")
-    with pytest.raises(ConfigError, match=rf"{name}.*: it (exists already|cannot be made)"):
+    with pytest.raises(ConfigError, match=rf"{name}.*: this (already exists|cannot be made)"):
         make_file("sequence", "first", tmp_path)
     assert not (tmp_path / "first.yaml").exists()
     assert (tmp_path / name).read_text() == ""
