@@ -163,8 +163,8 @@ def test_an_option_replaces_the_scan_of_its_address_with_a_note() -> None:
 
 
 BAD = [
-    ("scan: 5", "1:7: scan is 5; expected a mapping of addresses"),
-    ("scan: {}", "1:7: scan is empty"),
+    ("scan: 5", "1:7: the scan is 5; expected a mapping of addresses"),
+    ("scan: {}", "1:7: the scan is empty"),
     ("scan: [3]", "1:8: a group of the scan is 3"),
     ("scan: {shot.sort.window: 5 ms}", "1:26: the scan of 'shot.sort.window' is '5 ms'; expected a list"),
     ("scan: {shot.sort.window: {linspce: [1, 2, 3]}}", "1:27: 'linspce' is not a way to give values"),
@@ -180,7 +180,7 @@ BAD = [
     ("scan: {shot.sort.window: [1 ms, 1 ms]}", "1:33: '1 ms' occurs twice in the scan"),
     (
         "scan: {shot.sort.window: [1], shot.2.rearrange.window: [2]}",
-        "1:31: 'shot.2.rearrange.window' is scanned",
+        "1:31: 'shot.2.rearrange.window' and 'shot.sort.window' are both scanned",
     ),
     (
         "scan: {shot.sort: [{}], shot.sort.window: [2]}",

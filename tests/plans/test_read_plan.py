@@ -92,5 +92,5 @@ def test_options_that_only_planning_takes_are_refused(options: dict[str, Any], o
 
 
 def test_values_of_a_profile_need_a_profile() -> None:
-    with pytest.raises(ConfigError, match="no --profile"):
+    with pytest.raises(ConfigError, match="--profile is missing"):
         read(planned(seed=1), overrides=["profile.mobile_tweezers.speed=65 um/ms"])
