@@ -179,7 +179,7 @@ class BitmapSettings(Settings):
     )
     clear: Literal["bounding_box", "none"] = Field(
         default="bounding_box",
-        description="`bounding_box` if all other sites of the drawing must be empty, else `none`",
+        description="bounding_box if all other sites of the drawing must be empty, none if not",
     )
     _mask: NDArray[np.bool_] = PrivateAttr()
 
