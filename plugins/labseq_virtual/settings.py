@@ -141,7 +141,7 @@ class ImageSettings(Settings):
     )
     sensor: Literal["emccd", "qcmos"] = Field(
         default="emccd",
-        description="`emccd` (paper) uses the settings below, and `qcmos` the settings in `qcmos`",
+        description="kind of camera, `emccd` (paper) with the settings below or `qcmos` with those in `qcmos`",
     )
     clock_induced_charge: NonNegativeFloat = Field(
         default=0.005, description="mean spurious electrons per pixel and frame (ours: typical of EMCCDs)"
@@ -309,7 +309,7 @@ class QubitSettings(Settings):
         description="frequency of the transition (ours: the clock transition of rubidium 87, without shifts)",
     )
     rabi_frequency: Annotated[Frequency, Field(ge=0)] = Field(
-        default=20e3, description="Rabi frequency on resonance. A pi pulse takes half of its inverse (ours)"
+        default=20e3, description="resonant Rabi frequency. A pi pulse takes half of its inverse (ours)"
     )
     relaxation_time: PositiveDuration = Field(
         default=20e-3, description="time constant T1 with which the populations become equal (ours)"

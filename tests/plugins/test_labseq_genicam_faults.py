@@ -75,7 +75,9 @@ def test_a_failed_buffer_is_a_lost_frame_and_the_series_goes_on() -> None:
         lab.camera.trigger()
         frames = [lab.camera.read(1.0)]
         lab.camera.trigger()
-        with pytest.raises(TransientError, match=r"frame 1 was lost from .* 3: .*network packets are missing"):
+        with pytest.raises(
+            TransientError, match=r"frame 1 was lost from .* 3: .*network packets are missing"
+        ):
             lab.camera.read(1.0)
         del lab.world.shown[1]
         lab.camera.trigger()
