@@ -141,7 +141,7 @@ class ImageSettings(Settings):
     )
     sensor: Literal["emccd", "qcmos"] = Field(
         default="emccd",
-        description="kind of camera, `emccd` (paper) with the settings below or `qcmos` with those in `qcmos`",
+        description="kind of camera, `emccd` (paper) with the settings below or `qcmos` with its own",
     )
     clock_induced_charge: NonNegativeFloat = Field(
         default=0.005, description="mean spurious electrons per pixel and frame (ours: typical of EMCCDs)"
