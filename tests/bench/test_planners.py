@@ -188,7 +188,7 @@ def test_a_planner_that_cannot_be_warmed_is_named() -> None:
             {"target": "{pattern: compact, rows: 30, cols: 30}"},
             "--target {pattern: compact, rows: 30, cols: 30}: the size of the target is 30 rows",
         ),
-        ({"dop": "21"}, "--dop 21: .*; expected 1 to 20, the most tweezers.*max_tweezers=21"),
+        ({"dop": "21"}, "--dop 21: .*; expected 1 to 20, the maximum number of tweezers.*max_tweezers=21"),
         (
             {
                 "dop": "6",

@@ -60,7 +60,7 @@ def test_a_table_with_a_line_per_planner(capsys: pytest.CaptureFixture[str]) -> 
     assert second.split()[:3] == ["psca", "degree_of_parallelism=2", "2"]
     assert blank == ""
     assert extent.startswith("20 loadings, bound ")
-    assert "seed 1; " in extent
+    assert "seed 1, " in extent
     progress = [line for line in err.splitlines() if not line.startswith("compiling")]
     assert progress == [f"{n} of 20 loadings" for n in (*range(5, 21, 5),)]
 

@@ -309,7 +309,9 @@ def test_a_response_that_is_not_linear_takes_some_rounds_more(response: Any) -> 
 
 def test_too_much_noise_ends_the_loop_and_names_the_averages_needed() -> None:
     array = Array(6, noise=0.1)
-    with pytest.raises(DeviceError, match=r"noise: 20 averages .* about \d+ averages") as reported:
+    with pytest.raises(
+        DeviceError, match=r"too much noise, as 20 averages .* about \d+ averages"
+    ) as reported:
         begin(array, EqualiseSettings(max_averages=20))
     needed = int(str(reported.value).split("about ")[1].split()[0])
     again = Array(6, noise=0.1)

@@ -121,7 +121,7 @@ def test_losses_that_no_offset_explains_are_reported_too() -> None:
         def _probe(self, seen: NDArray[np.bool_], program: Any) -> None:
             seen[1::2] = False  # both groups that went along one axis, and none of those along the other
 
-    with pytest.raises(DeviceError, match="fits no small offset of the mobile tweezers: run `labseq"):
+    with pytest.raises(DeviceError, match="fits no small offset of the mobile tweezers; run `labseq"):
         run(overlay_lab(Uneven((0.0, 0.0))), check_overlay(exceeded="stop"))
 
 

@@ -66,7 +66,7 @@ def test_amplitudes_measured_on_frames_make_the_depths_of_moves_equal(tmp_path: 
     [
         (
             "profile.mobile_tweezers.max_column_tones=9",
-            "number of column tones at once, to measure",
+            "number of column tones to measure at once is 10",
         ),
         ("shot.0.equalise.device=meter", "'meter' is not a camera; choose a camera for mobile tweezers"),
     ],

@@ -219,7 +219,7 @@ def test_a_simulated_run_serves_dry_runs_only(measured: Any, lab: Any) -> None:
     text = lab.profile.read_text("utf-8")
     lab.profile.write_text(text.replace("camera: {use: virtual}", "camera: {use: slow}"), "utf-8")
     source = measured.sites.run.path
-    with pytest.raises(ConfigError, match="the run was simulated; expected one with real devices"):
+    with pytest.raises(ConfigError, match="the run was simulated; expected a run with real devices"):
         lab.calibrate("sites", source=source)
     outcome = lab.calibrate("sites", source=source, dry_run="full")
     assert outcome.stored.path.parent == lab.store.folder / "dry-run"

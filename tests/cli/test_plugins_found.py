@@ -83,7 +83,7 @@ def test_the_list_of_plugins_runs_no_code_of_a_folder_that_nothing_names(call: A
     out = call("plugins", "--json")[1]
     found = {one["name"]: one for one in json.loads(out)["plugins"]}
     assert found["mine"]["state"] == "not loaded"
-    assert found["mine"]["reason"].startswith("use --plugins plugins; ")
+    assert found["mine"]["reason"].startswith("use --plugins plugins, or write ")
     assert "labseq_spcm_sim" not in found
     assert not Path("code_ran").exists()
     out = call("plugins", "--plugins", "plugins", "--json")[1]

@@ -71,7 +71,7 @@ def test_an_override_replaces_a_wrong_value(tmp_path: Path) -> None:
 
 def test_only_the_newer_format_is_reported(tmp_path: Path) -> None:
     (line,) = refusal(tmp_path, "labseq: 2\nnew: 1\nshots: 0\n").splitlines()
-    assert re.match(r":1:9: .*format is 2, this labseq reads 1; update labseq", line)
+    assert re.match(r":1:9: .*format is 2, this labseq reads 1\); update labseq", line)
 
 
 def test_all_problems_at_once(tmp_path: Path) -> None:

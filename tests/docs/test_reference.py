@@ -172,7 +172,7 @@ def test_every_setting_says_what_it_is(model: SettingsType) -> None:
     assert model.__doc__
     for one in (one for inner in (model, *models_below(model)) for one in settings_of(inner)):
         assert one.description, f"'{one.key}' of {model.__name__} has no description"
-        assert re.fullmatch(r"(?s)[a-z0-9\[].*[^.\s]", one.description), one.description
+        assert re.fullmatch(r"(?s)[a-z0-9\[`'].*[^.\s]", one.description), one.description
 
 
 def rows_of(found: Any) -> dict[str, Sequence[str]]:

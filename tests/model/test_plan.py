@@ -110,9 +110,9 @@ def test_only_line_batches_are_linked():
     ("shapes", "message"),
     [
         ([[2, 1, 1]] * 2, "has 2 rows"),
-        ([[2, 1, 2]], "asks for 6 positions and 3 knots; 4 and 2 are given"),
-        ([[-2, 1, 1]], "asks for"),
-        ([], "asks for 0"),
+        ([[2, 1, 2]], "requires 6 positions and 3 knots, but 4 and 2 are given"),
+        ([[-2, 1, 1]], "requires -4"),
+        ([], "requires 0"),
     ],
 )
 def test_flat_arrays_of_paths_belong_together(shapes, message):

@@ -89,7 +89,7 @@ LANDS = {"empty_tweezers_may_land": True}
         ("crossing", r"at the atom on \(0, 1\)", "##..", [(0, 0, 0, 2)], along([0, 1], [2, 3]), {}),
         ("crossing", r"at the atom on \(0, 2\)", "#.#.", [(0, 0, 0, 1)], along([0, 1.75], [1, 3]), {}),
         ("path", r"closer than 1.9 um to .* on \(0, 1\)", "##.", [(0, 0, 0, 2)], along([0], [2]), {}),
-        ("path", r"an atom ends on the atom on \(0, 3\)", "#..#", [(0, 0, 0, 1)], along([0, 2], [1, 3]), {}),
+        ("path", r"tweezer ends on the atom on \(0, 3\)", "#..#", [(0, 0, 0, 1)], along([0, 2], [1, 3]), {}),
         ("path", r"atom on \(0, 2\)", "#.#.", [(0, 0, 0, 1)], along([0, 1], [1, 3]), LANDS),
         # the atom of row 0 is dropped off, and in the leg that follows the tweezer of row 3 passes over it
         ("path", r"atom on \(0, 0\)", "# . . #", [(0, 0, 0, 0), (3, 0, -1, 0)],

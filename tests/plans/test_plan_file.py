@@ -48,10 +48,10 @@ def test_a_plan_is_read_as_it_was_written() -> None:
 
 BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda v: v.pop("batches"), "plan.json: 'batches' is missing"),
-    (lambda v: v.pop("grid"), "plan.json: 'grid' is missing (the sites that it is for)"),
+    (lambda v: v.pop("grid"), "plan.json: 'grid' is missing (the sites that the plan is for)"),
     (lambda v: v.update(batches=7), "batches is 7; expected a list"),
     (lambda v: v["batches"].append(7), "batches.2 is 7; expected a mapping"),
-    (lambda v: v["batches"][1]["to"].append([0, 0]), "'from' has 1 sites, 'to' has 2"),
+    (lambda v: v["batches"][1]["to"].append([0, 0]), "'from' has 1 sites, but 'to' has 2"),
     (lambda v: v["batches"][0].update(to=[[0, 1.5]]), "to.0.1 is 1.5; expected a whole number"),
     (lambda v: v["batches"][0].update(to=[[0, 99999]]), "to.0.1 is 99999; expected at most 2000"),
     (lambda v: v["batches"][0].update(form=[]), "'form' is not a setting of"),

@@ -154,7 +154,7 @@ SLOW = ("profile.mobile_tweezers.speed=0.5 um/s",)
         (
             PlanRequest("random:3x3@1", "{pattern: compact, rows: 3, cols: 3}", seed=1),
             ConfigError,
-            "nothing to play: the plan has no",
+            "nothing to play because the plan has no",
         ),
         (
             PlanRequest(
@@ -165,7 +165,7 @@ SLOW = ("profile.mobile_tweezers.speed=0.5 um/s",)
                 overrides=SLOW,
             ),
             ConfigError,
-            r"the waveform is .* s long; expected at most 60 s; look",
+            r"the waveform is .* s long; expected at most 60 s; check",
         ),
         (
             PlanRequest("random:30x30@0.6", "{pattern: compact, rows: 20, cols: 20}", seed=1),

@@ -168,7 +168,7 @@ def test_looking_for_a_serial_number_leaves_other_cameras_cold() -> None:
     lab = unopened(serial=4711)
     lab.sim.cooler.SetTemperature(-70)
     lab.sim.cooler.CoolerON()
-    with pytest.raises(DeviceError, match="expected 4711"):
+    with pytest.raises(DeviceError, match="10001, not 4711"):
         lab.camera.open()
     assert lab.sim.cooler.is_on
 

@@ -72,7 +72,7 @@ def test_it_takes_its_time_to_arm(driver: str) -> None:
             starts_s.append(lab.clock.now())
         again_s = 0.0 if driver == "genicam" else 0.03  # it goes on waiting for triggers
         assert np.diff(starts_s) == pytest.approx([0.03, again_s])
-        with pytest.raises(DeviceError, match="not armed"):
+        with pytest.raises(DeviceError, match="without being armed"):
             lab.camera.trigger()
 
 
@@ -173,7 +173,7 @@ def test_an_external_start_begins_a_series_that_later_edges_do_not_change(driver
             lab.world.pulse("camera", start_s + 0.12, 1e-3)
             frames = [lab.camera.read(1.0)]
             lab.world.pulse("camera", lab.clock.now(), 1e-3)
-            with pytest.raises(DeviceTimeoutError, match=r"frame 1 of the series .* is not ready"):
+            with pytest.raises(DeviceTimeoutError, match=r"frame 1 of the .*series is not ready"):
                 lab.camera.read(1e-3)
             frames += [lab.camera.read(1.0) for _ in range(2)]
             starts_s = [start_s + 0.12 + 0.05 * n for n in range(3)]

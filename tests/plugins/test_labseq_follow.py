@@ -115,7 +115,7 @@ def test_a_go_that_no_step_waits_for_is_answered_at_the_deadline() -> None:
 
 
 def test_a_timeout_says_whether_a_leader_is_connected() -> None:
-    silent = r"'go' within 10 ms on 127.0.0.1:\d+; no leader"
+    silent = r"'go' within 10 ms on 127.0.0.1:\d+, and no leader"
     with listening() as device, pytest.raises(DeviceTimeoutError, match=silent):
         device.wait_for("go", 0.01)
     with led() as (device, _):

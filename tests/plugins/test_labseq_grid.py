@@ -91,7 +91,7 @@ def test_few_defects_take_few_batches(defects: set[int], seed: int) -> None:
         (
             SiteGrid(),
             MotionSpec(rf=RfSpec(column_band_hz=(84e6, 118e6))),
-            r"column tone.*83\.824 MHz.*84 to 118 MHz.*eject_slots: 0",
+            r"column tone.*83\.824 MHz.*84 to 118 MHz.*eject_slots to 0",
         ),
     ],
 )

@@ -234,7 +234,11 @@ def test_the_serial_number_chooses_the_camera() -> None:
 @pytest.mark.parametrize(
     ("settings", "kind", "text"),
     [
-        ({"region": {"y": 2, "x": 0, "height": 8, "width": 8}}, LimitError, "y is 2; .*steps of 4.*good one"),
+        (
+            {"region": {"y": 2, "x": 0, "height": 8, "width": 8}},
+            LimitError,
+            "y is 2; .*steps of 4.*nearest possible value is 4",
+        ),
         ({"region": {"height": 8, "width": 10}}, LimitError, "width is 10; the limit is 4 to 128, in steps"),
         ({"binning": 3, "region": {"height": 96, "width": 96}}, DeviceError, "binned by 2 x 2, not what"),
         ({"readout_mode": "quiet"}, DeviceError, "'quiet', which this camera does not have; it has.*slow"),

@@ -349,7 +349,7 @@ def test_idle_lines_stay_on_between_steps() -> None:
 
 
 def test_an_undeclared_line_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"`lights.loading` .*'mott'; .*'cooling'"):
+    with pytest.raises(ConfigError, match=r"`lights.loading` .*'mott', but .*'cooling'"):
         Lights(LightSettings(loading=("mott",)), SPECS)
 
 

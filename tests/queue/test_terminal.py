@@ -74,7 +74,7 @@ def test_the_list_says_what_one_should_know(capsys: pytest.CaptureFixture[str]) 
     assert err.startswith(f"{Path.cwd() / 's.yaml'} (as queued):4:10: there is no hardware profile at ")
     code, out, _ = call(capsys, "queue", "list")
     *_, changed, why = out.splitlines()
-    assert changed.startswith("1: s.yaml was changed")
+    assert changed.startswith("1: s.yaml has been changed")
     assert why.startswith("1: ")
     assert "there is no hardware profile" in why
     values = json.loads(call(capsys, "queue", "list", "--json")[1])["entries"][0]

@@ -84,7 +84,7 @@ def test_a_damage_is_found_and_nothing_is_deleted(run_dir: Path, plant: Callable
         (flipped_bit, "checksum", "shot_000001.h5"),
         (lost_file, "missing", "shot_000001.h5"),
         (damaged_line, "line 2 is damaged", "index.jsonl"),
-        (line_of_no_shot, "is not a shot's", "index.jsonl"),
+        (line_of_no_shot, "describes no shot", "index.jsonl"),
         (damaged_state, "damaged", "STATE"),
         (shot_of_another_run, "2020-01-01/0001_other", "shot_000001.h5"),
         (foreign_skip, "torn last line", "skipped.jsonl"),

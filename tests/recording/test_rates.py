@@ -31,5 +31,5 @@ def test_nothing_is_known_without_trials() -> None:
 
 @pytest.mark.parametrize(("n", "n_trials"), [(-1, 3), (4, 3)])
 def test_more_than_all_is_refused(n: int, n_trials: int) -> None:
-    with pytest.raises(ValueError, match=f"{n} of {n_trials}"):
+    with pytest.raises(ValueError, match=f"{n} events in {n_trials} trials"):
         jeffreys(n, n_trials)

@@ -364,7 +364,7 @@ def test_keys(tmp_path: Path, keys: Path, monkeypatch: pytest.MonkeyPatch) -> No
         (stranger / "known" / "here.key").write_bytes((keys / "here.key").read_bytes())
         with monkeypatch.context() as patch:
             patch.setattr(wire_of_plugins, "keys_root", lambda: stranger)
-            with pytest.raises(DeviceError, match="does not know the key"):
+            with pytest.raises(DeviceError, match="does not know this computer's key"):
                 with_key().open()
         with pytest.raises(DeviceError, match="keys do not match"):  # without keys
             RemoteDevice(one.settings("instrument"), Context("laser", clock=FakeClock())).open()

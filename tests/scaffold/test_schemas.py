@@ -29,7 +29,7 @@ FILES = [
 ]
 ABOUT_VALUES = re.compile(
     r"with '/' in it|at least one letter|is taken by step|'0 ms'; expected more|one per cycle"
-    r"|in SI units|a wait needs|excludes 'for'|has no 'timeout'|needs 'for'|lowest of the"
+    r"|in SI units|a wait needs|is given with 'for'|has no 'timeout'|needs 'for'|lowest of the"
     r"|a step of 0|a device is called|there is no device|`blinding` is set for a camera"
 )
 """Messages about the values of a file that is well-formed; only `labseq check` reports them."""

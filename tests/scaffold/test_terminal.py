@@ -98,7 +98,7 @@ def test_mistakes_with_schemas(arguments: list[str], said: str, capsys: pytest.C
     [
         ([], r"  step  +check_overlay.*  command  +the commands"),
         (["step", "image"], r"^step image\n\nTakes an image.*  exposure  +exposure time .*default: 45 ms"),
-        (["profile.camera"], r"The plugins.*  virtual  +Frames of the simulation"),
+        (["profile.camera"], r"The plugins.*  virtual  +Takes frames of the simulation"),
         (["psca"], r"^planner psca\n.*  degree_of_parallelism  "),
         (["exposure"], r"^exposure can be:.*  step image exposure\s+exposure time.*step rearrange exposure"),
         (["field", "confidence"], r"^field detection/confidence\n"),

@@ -206,7 +206,7 @@ BOTH = "from: 1, to: 9"
         ),
         (
             f"use: climb, over: {{{DOP}: {{{BOTH}, steps: 3}}}}, maximise: success, points: 3",
-            "3 equal steps from 1 to 9 are not whole numbers; expected a number of steps that 8 is a",
+            "3 equal steps from 1 to 9 are not whole numbers; expected a number of steps that divides 8",
         ),
         (
             f"use: climb, over: {{grid.rows: {{{BOTH}}}}}, maximise: success, points: 3",

@@ -128,7 +128,7 @@ CASES: list[tuple[str, dict[str, str], list[str]]] = [
         "frames that the detector does not take",
         {"frame: [512, 512]": "frame: [600, 600]"},
         [
-            "p.yaml:67:8: detector: the frame is uint16 (512, 512); according to the detector's settings, the sites are on uint16 frames of (600, 600); calibrate the sites, or check `centre_px`, `pixel_size`, `angle` and `frame` of the detector"
+            "p.yaml:67:8: detector: the frame is uint16 (512, 512), but according to the detector's settings the sites are on uint16 frames of (600, 600); calibrate the sites, or check the detector's `centre_px`, `pixel_size`, `angle` and `frame`"
         ],
     ),
     (

@@ -72,7 +72,7 @@ def test_npy_of_any_number_type(tmp_path: Path, dtype: Any, order: Any) -> None:
 @pytest.mark.parametrize(
     ("array", "words"),
     [
-        (np.zeros((2, 3, 4)), "a.npy: it holds 2 occupancies; expected"),
+        (np.zeros((2, 3, 4)), "a.npy: there are 2 occupancies; expected"),
         (np.array([["1", "0"]]), "type <U1"),
         (np.array([[1, 2]]), "only contain 0 and 1"),
         (np.array([[np.nan, 1.0]]), "only contain 0 and 1"),
@@ -107,13 +107,16 @@ def test_one_of_several_occupancies_in_the_files_of_other_programs(tmp_path: Pat
     for address, words in (
         ("two.npz", "two.npz: it holds 2 arrays; expected one of loaded, after; name one: two.npz:loaded"),
         ("two.npz:load#1", "it holds no array 'load'; expected one of loaded, after; did you mean 'loaded'?"),
-        ("two.npz:loaded", "it holds 2 occupancies; expected"),
+        ("two.npz:loaded", "there are 2 occupancies; expected"),
         ("two.npz:loaded#2", "there is no occupancy '2'; expected 0 to 1"),
         (
             "one.npz#0",
             "the array has shape (2, 3); expected (rows, columns), or (occupancies, rows, columns)",
         ),
-        ("a.h5", "is not a shot's file of labseq; expected a shot's file; name the array"),
+        (
+            "a.h5",
+            "is not a shot's file of labseq; expected a shot's file; for another program",
+        ),
         ("a.h5:time", "holds no array 'time'; expected scan 1/loaded (2, 2, 3)"),
         ("b.npz", "there is no such file"),
     ):

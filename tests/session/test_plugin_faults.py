@@ -332,5 +332,5 @@ def test_a_run_warns_of_what_its_own_plugins_print() -> None:
     (text,) = [values["text"] for name, values in seen.events if name == "warning"]
     assert "while it was loaded it printed 'used' to stderr" in text
     (log,) = Path("data").glob("*/*/events.jsonl")
-    assert "it printed ('used')" in log.read_text("utf-8")
+    assert "it printed 'used'" in log.read_text("utf-8")
     assert "unused" not in log.read_text("utf-8")

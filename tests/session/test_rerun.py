@@ -66,7 +66,7 @@ def test_a_run_is_taken_again(tmp_path: Path) -> None:
     assert (again.seed, again.changes) == (first.seed, {**first.changes, "seed": str(first.seed)})
     assert np.array_equal(again.shots[0].occupancies, first.shots[0].occupancies)
     assert again.note == f"rerun of {first.path.parent.name}/{first.path.name}"
-    assert not [values for values in seen.of("warning") if "other than" in values["text"]]
+    assert not [values for values in seen.of("warning") if "changed since" in values["text"]]
     record = json.loads((first.path / "run.json").read_text("utf-8"))
     record["provenance"]["labseq"] = "0.1.9"
     (first.path / "run.json").write_text(json.dumps(record), "utf-8")
@@ -74,5 +74,5 @@ def test_a_run_is_taken_again(tmp_path: Path) -> None:
     assert (other.n_shots, other.seed == first.seed) == (2, False)
     with pytest.raises(ConfigError, match="shots is 0"):
         labseq.Session.rerun(first.path, shots=0)
-    (text,) = [values["text"] for values in seen.of("warning") if "other than" in values["text"]]
+    (text,) = [values["text"] for values in seen.of("warning") if "changed since" in values["text"]]
     assert text == f"changed since {first.path.name}: labseq was 0.1.9 and is now {labseq.__version__}"

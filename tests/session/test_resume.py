@@ -124,7 +124,7 @@ def test_a_shot_whose_file_is_gone_is_taken_again(stopped: Path) -> None:
     run = resumed(stopped, seen)
     assert len(run.shots) == 6
     assert all(shot.file.exists() for shot in run.shots)
-    assert any("taken again: 1" in values["text"] for values in seen.of("warning"))
+    assert any("files are gone: 1" in values["text"] for values in seen.of("warning"))
 
 
 def state_of_another(run_dir: Path, **changes: str) -> None:
@@ -177,7 +177,7 @@ REFUSED: dict[str, tuple[Any, type[Exception], str]] = {
     "another text": (
         lambda run: (run / "sequence.yaml").write_text("labseq: 1\n"),
         RecordingError,
-        "not what run.json says",
+        "not the file described in run.json",
     ),
     "no profile": (lambda run: (run / "profile.yaml").unlink(), RecordingError, "cannot be read"),
     "a newer format": (
@@ -220,7 +220,7 @@ def test_a_run_that_cannot_be_resumed_is_left_alone(stopped: Path, name: str) ->
 
 def test_a_run_that_may_be_in_progress_elsewhere_is_a_change(stopped: Path) -> None:
     state_of_another(stopped, host="another")
-    with pytest.raises(ConfigError, match=r"computer was another, .*in progress there"):
+    with pytest.raises(ConfigError, match=r"computer was another .*in progress there"):
         labseq.Session.resume(stopped)
     assert resumed(stopped, accept_changes=True).status == "complete"
 
