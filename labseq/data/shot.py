@@ -220,7 +220,7 @@ class Shot:
             RecordingError: The file cannot be read, or has changed since it was written.
         """
         try:
-            sha256 = digest_of(self.file).sha256
+            sha256 = digest_of(self.file, self.row.bytes).sha256
         except OSError as error:
             raise RecordingError(self.file, f"cannot be read: {error.strerror}", "check the disk") from error
         if sha256 != self.row.sha256:

@@ -348,7 +348,7 @@ class _Check:
         numbers, last = [*rows], [*rows.values()][-1]
         path = self.folder / last.file
         try:
-            n_bytes, sha256, is_marked = digest_of(path)
+            n_bytes, sha256, is_marked = digest_of(path, max(row.bytes for row in rows.values()))
         except FileNotFoundError:
             index.remove(numbers)
             remedy = "its line moved to quarantine; if you find the file, put it back and run this again"

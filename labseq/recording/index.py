@@ -54,19 +54,26 @@ class ShotDigest(NamedTuple):
     is_marked: bool
 
 
-def digest_of(path: Path) -> ShotDigest:
+def digest_of(path: Path, max_bytes: int | None = None) -> ShotDigest:
     """Read a shot's file for its digest. The mark of a program that opens it for writing is ignored.
+
+    Args:
+        path: The file.
+        max_bytes: Its size in the index. A longer file has changed. It is not read, and its digest is "".
 
     Raises:
         OSError: The file cannot be read.
     """
     with open_ordinary(path) as file:
+        n_bytes = os.fstat(file.fileno()).st_size
         head = file.read(24)
         is_marked = head[:9] == b"\x89HDF\r\n\x1a\n\0" and head[20:] == _OPEN_FOR_WRITING
+        if max_bytes is not None and n_bytes > max_bytes:
+            return ShotDigest(n_bytes, "", is_marked)
         digest = hashlib.sha256(head[:20] + bytes(4) if is_marked else head)
         while chunk := file.read(1 << 20):
             digest.update(chunk)
-        return ShotDigest(os.fstat(file.fileno()).st_size, digest.hexdigest(), is_marked)
+        return ShotDigest(n_bytes, digest.hexdigest(), is_marked)
 
 
 @dataclass(frozen=True, slots=True)

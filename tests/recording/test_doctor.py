@@ -97,6 +97,19 @@ def test_a_damage_is_named(run_dir: Path, plant: Callable[[Path], None], what: s
     assert [text for text, name in found if what in text and name == where], found
 
 
+@pytest.mark.parametrize("has_line", [True, False])
+def test_a_file_of_absurd_size_is_reported_without_reading_it(run_dir: Path, has_line: bool) -> None:
+    with (run_dir / "shots" / "shot_000001.h5").open("ab") as file:
+        file.truncate(1 << 40)  # its checksum would take hours
+    index = run_dir / "index.jsonl"
+    if not has_line:
+        lines = index.read_text("utf-8").splitlines(keepends=True)
+        index.write_text("".join(line for line in lines if "shot_000001.h5" not in line), "utf-8")
+    found = reported(examine(run_dir, dry_run=True))
+    what = "checksum" if has_line else "1099511627776 bytes"
+    assert [text for text, name in found if what in text and name == "shot_000001.h5"], found
+
+
 def test_a_whole_run_is_left_as_it_is(run_dir: Path) -> None:
     (run_dir / "notes.txt").write_text("my own")
     (run_dir / "shots" / "my notes.h5").write_bytes(b"\0")
