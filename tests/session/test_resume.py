@@ -220,7 +220,7 @@ def test_a_run_that_cannot_be_resumed_is_left_alone(stopped: Path, name: str) ->
 
 def test_a_run_that_may_be_in_progress_elsewhere_is_a_change(stopped: Path) -> None:
     state_of_another(stopped, host="another")
-    with pytest.raises(ConfigError, match=r"computer was another .*in progress there"):
+    with pytest.raises(ConfigError, match=r"computer was another and .*in progress there"):
         labseq.Session.resume(stopped)
     assert resumed(stopped, accept_changes=True).status == "complete"
 
