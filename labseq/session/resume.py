@@ -100,9 +100,7 @@ class ResumableRun:
         if shots is not None and shots <= run.n_shots:
             raise _refused(folder, f"it has {run.n_shots} shots; expected a larger number with --shots")
         if gone:
-            warnings.append(
-                f"the files of some shots are gone, so these shots are taken again: {_numbers(gone)}"
-            )
+            warnings.append(f"the files of some shots are gone; these are taken again: {_numbers(gone)}")
         return cls(run, done, tuple(changes), warnings, lock)
 
     @property
