@@ -12,6 +12,7 @@ import pytest
 from labseq_remote.settings import RemoteSettings
 
 import labseq.remote.control
+import labseq.remote.gate
 from labseq.remote.server import Server, Serving, serving
 
 PROFILE = """\
@@ -92,6 +93,7 @@ def _patient() -> Generator[None]:
         patch.setattr("labseq.plugin.wire.LOST_S", 2.0)
         patch.setattr(labseq.remote.control, "LOST_S", 2.0)
         patch.setattr(labseq.remote.control, "MAX_SESSIONS", 10_000)
+        patch.setattr(labseq.remote.gate, "_connection_limit", lambda: 300)
         yield
 
 
