@@ -124,7 +124,7 @@ def test_a_shot_whose_file_is_gone_is_taken_again(stopped: Path) -> None:
     run = resumed(stopped, seen)
     assert len(run.shots) == 6
     assert all(shot.file.exists() for shot in run.shots)
-    assert any("files are gone: 1" in values["text"] for values in seen.of("warning"))
+    assert any("taken again: 1" in values["text"] for values in seen.of("warning"))
 
 
 def state_of_another(run_dir: Path, **changes: str) -> None:
