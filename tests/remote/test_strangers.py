@@ -261,7 +261,7 @@ def test_strangers_without_a_key_leave_clients_and_files_alone(tmp_path: Path, k
 def test_a_client_that_reads_its_replies_gets_all_of_them() -> None:
     with zmq.Context() as context, wire.server_socket(context, "tcp://127.0.0.1:*", None) as server:
         server.rcvtimeo = server.sndtimeo = 5000
-        with connected(int(server.last_endpoint.rpartition(b":")[2])) as peer:
+        with connected(int(server.get_string(zmq.LAST_ENDPOINT).rpartition(":")[2])) as peer:
             for number in range(100):
                 peer.send(b"%d" % number)
             for _ in range(100):  # it never waits for a message, which is when ZeroMQ looks what was sent
