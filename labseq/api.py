@@ -101,8 +101,8 @@ def tone_program(
 
     Args:
         plan: A plan that :func:`check_plan` accepted.
-        grid: The grid of sites. Default is the profile's grid, without a profile the paper's.
-        motion: How the tweezers move. Default is the profile's motion, without a profile the paper's.
+        grid: The grid of sites. Default is the profile's grid, without a profile that of the paper.
+        motion: How the tweezers move. Default is the profile's motion, without a profile that of the paper.
         n_batches: Number of batches to play, from the first. Default is all.
         profile: Name or path of a hardware profile.
 

@@ -78,7 +78,7 @@ class Block(Settings, Generic[P]):
     parts: Annotated[dict[Text, P], empty_is({})] = Field(
         default={}, description="instead of `lines` and `duration`, successive pulses as name -> pulse"
     )
-    repeat: int = Field(default=1, ge=1, le=MAX_PULSES, description="how often the whole is played")
+    repeat: int = Field(default=1, ge=1, le=MAX_PULSES, description="how often the block is played")
 
     @property
     def n_played(self) -> int:

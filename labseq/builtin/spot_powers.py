@@ -93,7 +93,7 @@ class SpotPowers:
 
 
 def without_losses(take: Callable[[], Frame]) -> Frame:
-    """Take a frame. If it is lost on its way, try up to three times, because no atoms are needed."""
+    """Take a frame. If it is lost in transit, try up to three times, because no atoms are needed."""
     for _ in range(3):
         try:
             return take()

@@ -453,7 +453,7 @@ def watch(
 
 @app.command(short_help="Send a notice, to try notify.yaml.")
 def notify(
-    text: Annotated[str, typer.Argument(metavar="TEXT", help="The text.")] = "a notice to try the way",
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="The text.")] = "a test of notify.yaml",
 ) -> None:
     """Send a notice in every way that notify.yaml in the data folder names, and print what failed."""
     from labseq.cli.run import try_notice

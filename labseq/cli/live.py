@@ -145,7 +145,7 @@ class StageTally:
         self.n_over += timing.over_budget
 
     def medians_s(self) -> tuple[float, float]:
-        """Median on this computer's clock, and on the session's."""
+        """Median on the clocks of this computer and of the session."""
         return statistics.median(self.host_s), statistics.median(self.duration_s)
 
     def p99_s(self) -> float:

@@ -309,7 +309,7 @@ class Run:
         fits = self.fits(quantity, model, where=where, fixed=fixed, free=free, along=along)
         if len(fits) > 1:
             others = " and ".join(fits[0].values)
-            problem = f"there are {len(fits)} values of {others} to fit at"
+            problem = f"there are {len(fits)} values of {others}, each with its own fit"
             expected = "one value, chosen by 'where', or fits()"
             raise ConfigError(Problem(problem, clean(self.path.name), expected=expected))
         assert fits[0].fit is not None  # otherwise it has raised

@@ -501,7 +501,7 @@ def _indexed(
         rows, cols = lit_shape
         _fail(
             f"{rows} x {cols} rows and columns are lit, but the grid has {grid.n_rows} x {grid.n_cols}; "
-            "load a dark row or column at the edge, which is ambiguous, or set the "
+            "load a dark row or column at the edge (its place is ambiguous), or set the "
             f"size and `shear` of `grid` as in the static tweezers, or, {_MORE}",
         )
     return indexed.surface, first

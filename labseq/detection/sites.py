@@ -252,7 +252,7 @@ def checked_image(frame: Frame, known: KnownSites, name: str) -> NDArray[np.uint
     """The image of a frame, if it has the size that the sites belong to.
 
     Raises:
-        DeviceError: It has another size or dtype. ``name`` is the detector's.
+        DeviceError: It has another size or dtype. ``name`` is the name of the detector.
     """
     image = frame.image
     if image.shape != known.frame or image.dtype != np.uint16:

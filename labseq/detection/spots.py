@@ -78,7 +78,7 @@ def without_hot_pixels(image: NDArray[Any]) -> Floats:
 def pixel_noise(counts: Floats) -> float:
     """Noise of a pixel (1 sigma), from second differences, which smooth light does not change.
 
-    The mask is that of Immerkaer, Computer Vision and Image Understanding 64, 300
+    The mask is from Immerkaer, Computer Vision and Image Understanding 64, 300
     (1996). The darkest tenth of the frame's tiles counts, because spots add noise.
     """
     bends = counts[:-2] - 2 * counts[1:-1] + counts[2:]

@@ -50,7 +50,7 @@ def check_plan(
     monotonic until the second has. So the gap is monotonic from start to end and never below the smaller of
     its values at the two ends. These are whole numbers of sites, so it is at least one site if the order is
     kept. If the speed is not constant, and on paths from one knot to the next, all tones have made the same
-    fraction of their ways at any time, so the gap changes evenly from start to end.
+    fraction of their paths at any time, so the gap changes evenly from start to end.
 
     Args:
         plan: The plan.

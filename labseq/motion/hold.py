@@ -62,7 +62,7 @@ def hold_program(
         offset_m: Offset of each tweezer from its site, along a1 (the columns' tones) and a2 (the rows').
             Shape (2,) for all, or (n_rows, n_cols, 2).
         hold_s: Time between the ramps, in seconds, or 0.
-        drop_off_s: Duration of the drop-off, in seconds. By default the motion's.
+        drop_off_s: Duration of the drop-off, in seconds. By default the drop-off of the motion.
 
     Returns:
         The tones of both axes, with one or more batches for each row and offset.

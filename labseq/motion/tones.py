@@ -24,7 +24,7 @@ SPEED_PROFILES: Final[tuple[SpeedProfile, ...]] = get_args(SpeedProfile)
 def site_time_s(grid: SiteGrid, motion: MotionSpec) -> float:
     """Time to move an atom by one site, in seconds.
 
-    If the speed is not constant, this is the mean time over the longest way of a batch, so that a batch takes
+    If the speed is not constant, this is the mean time over the longest path of a batch, so a batch takes
     the same time with every speed profile.
 
     Example:
@@ -95,12 +95,12 @@ def tone_program(
     Each batch has a pause without tones, the pick-up, the transport and the drop-off. The pause is the
     overhead of a batch. The overhead of the cycle has passed before anything plays. A transport at constant
     speed is cut wherever a tone arrives. With another speed profile all tones start and arrive together, each
-    with its own way. The longest way of the batch has the mean speed of the setting, so that the batch lasts
+    on its own path. The longest path of the batch has the mean speed of the setting, so the batch lasts
     as long as at constant speed. At pick-up and drop-off the tones of the axis that moves are ramped,
     linearly in trap depth. The tones of the other axis are switched on and off over 2 us at the two ends of
     the batch. There is no drop-off, pause or pick-up between linked batches.
 
-    In a batch with paths of tones each leg is a segment, whose longest way has the mean speed of the setting.
+    In a batch with paths of tones each leg is a segment, whose longest path has the set mean speed.
     Frequency and amplitude squared are interpolated between sites. Row tones are ramped. At a knot before the
     last, the tones that go off there are ramped while the others wait. The row tones are weaker by the square
     root of ``path_depth``.
@@ -114,7 +114,7 @@ def tone_program(
 
     Args:
         plan: A plan that :func:`check_plan` accepted.
-        grid: The grid of sites. By default the paper's.
+        grid: The grid of sites. By default the grid of the paper.
         motion: How the tweezers move. By default as in the paper.
         n_batches: How many batches to play, from the first. By default all.
 

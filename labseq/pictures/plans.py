@@ -90,7 +90,7 @@ def heights(lane: NDArray[np.intp]) -> NDArray[np.float64]:
 def hops(
     start: NDArray[np.float64], end: NDArray[np.float64], height: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Make each arrow a flat arc to the left of its way, so that opposite ways differ.
+    """Make each arrow a flat arc to the left of its path, so that opposite paths differ.
 
     The arc is a quadratic Bezier curve.
 
@@ -249,7 +249,7 @@ def paint_moves(axes: Axes, sheet: Sheet, grid: SiteGrid, moves: NDArray[np.int1
 
 
 def paint_paths(axes: Axes, sheet: Sheet, grid: SiteGrid, batch: Batch, colour: Any) -> None:
-    """Paint the ways of all tweezers of a batch with paths of tones, dotted without an atom."""
+    """Paint the paths of all tweezers of a batch with paths of tones, dotted without an atom."""
     paths, points = batch.tones, sheet.site_in * POINTS_PER_INCH
     assert paths is not None
     thick = min(1.5, 0.11 * points)

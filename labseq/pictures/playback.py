@@ -39,7 +39,7 @@ SITE_0_HZ, SITE_HZ = 1e9, 1e6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AtomTrack:
-    """The way of one atom.
+    """The path of one atom.
 
     Attributes:
         knots: float64 (n, 3), time in s, row, column. Straight between knots, at rest before and after them.
@@ -151,7 +151,7 @@ class Playback:
         return next((step for step in steps if self.end_s - self.start_s <= 20.0 * step), 0.05)
 
     def trails(self, t_s: float) -> list[Floats]:
-        """The ways of the atoms in the batch that is played, until a time, float64 (n, 2) each, in sites."""
+        """The paths of the atoms in the batch that is played, until a time, float64 (n, 2) each, in sites."""
         batch = self.at_batch(t_s)
         since_s = self.batch_s[batch, 0] if batch < len(self.batch_s) else math.inf
         passed = [
@@ -249,7 +249,7 @@ def _places(axis: AxisTones, segment: int) -> Floats:
 
 
 def _pieces(program: ToneProgram, segment: int, joint_s: Floats) -> Iterator[tuple[float, float, float]]:
-    """Time of each knot of a segment, and fractions of its duration and its ways until then."""
+    """Time of each knot of a segment, and fractions of its duration and its paths until then."""
     course = FrequencyCourse(int(program.course[segment]))
     first_s, last_s = joint_s[segment : segment + 2].tolist()
     # 12 straight pieces for a segment in which the speed changes
@@ -295,7 +295,7 @@ def _atom_tracks(
     occupancy: Occupancy,
     motion: MotionSpec,
 ) -> tuple[AtomTrack, ...]:
-    """The way of each atom, which follows the tones that cross on it while its batch is played."""
+    """The path of each atom, which follows the tones that cross on it while its batch is played."""
     homes = np.argwhere(occupancy)
     tracks: list[list[Knot]] = [[(float(joint_s[0]), float(row), float(col))] for row, col in homes.tolist()]
     on_site = np.full(occupancy.shape, -1)
@@ -318,7 +318,7 @@ def _atom_tracks(
 
 
 def _carry(tracks: list[list[Knot]], program: ToneProgram, segment: int, joint_s: Floats) -> None:
-    """Continue the ways of atoms by a segment. Atoms whose tones are already off stay at rest."""
+    """Continue the paths of atoms by a segment. Atoms whose tones are already off stay at rest."""
     rows, columns = (dict(_places(axis, segment).tolist()) for axis in (program.row, program.column))
     pieces = list(_pieces(program, segment, joint_s))
     for track in tracks:

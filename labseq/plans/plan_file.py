@@ -212,8 +212,8 @@ def read_plan(
 
     Args:
         data: The output of ``labseq plan --json``, in UTF-8.
-        request: Names the profile with grid and motion. Without a profile the grid is the file's, and the
-            motion the paper's. Nothing is planned.
+        request: Names the profile with grid and motion. Without a profile the grid comes from the file, and
+            the motion from the paper. Nothing is planned.
         announce: Called before kernels are compiled, with roughly how long that takes in seconds.
 
     Raises:

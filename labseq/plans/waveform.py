@@ -77,7 +77,7 @@ def read_moves(
 
 
 def read_sample_rate(text: str | None, request: PlanRequest, machine: dict[str, Any]) -> SampleRate:
-    """Find the sample rate from the option, else from the profile, else use the paper's.
+    """Find the sample rate from the option, else from the profile, else take that of the paper.
 
     A profile has one if the plugin of its mobile tweezers has a setting ``sample_rate``.
 
@@ -169,7 +169,7 @@ class WaveformRequest:
     Attributes:
         plan: The request for a plan. Its occupancy may also be a plan, as in :func:`read_moves`.
         batches: "2" or "1-3", from 0, or None for all.
-        sample_rate: A frequency, or None for the profile's.
+        sample_rate: A frequency, or None for that of the profile.
     """
 
     plan: PlanRequest

@@ -94,7 +94,7 @@ def _is_numeric(value: Any) -> bool:
 
 
 def write_array(group: Any, path: str, values: Any, units: str | None = None) -> Any:
-    """Add an array of :data:`ARRAYS` under the last part of its path. ``units`` replaces the schema's."""
+    """Add an array of :data:`ARRAYS` under the last part of its path. ``units`` overrides the schema."""
     array = ARRAYS[path]
     dataset = group.create_dataset(path.rpartition("/")[2], data=np.asarray(values, array.dtype))
     describe(dataset, array, units)

@@ -110,7 +110,7 @@ def make_plugin(kind: str, name: str, folder: Path, *, package: bool = False) ->
 
     Args:
         folder: Folder of sequences and profiles. The plugin goes into ``plugins`` there.
-        package: Whether to make its own distribution, next to them.
+        package: Whether to make a distribution of its own, in ``folder``.
 
     Raises:
         ConfigError: The name is not allowed or taken, or a file cannot be written.

@@ -53,7 +53,7 @@ class Rehearsal:
 
 
 def quantile(values: NDArray[np.float64], share: float) -> float:
-    """Quantile of at least one value, without numpy's, which imports ``numpy.ma`` in 40 ms."""
+    """Quantile of at least one value, because numpy's imports ``numpy.ma`` in 40 ms."""
     ranks = np.arange(len(values))
     return float(np.interp(share * ranks[-1], ranks, np.sort(values)))
 

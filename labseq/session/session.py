@@ -300,7 +300,7 @@ class Session(PreparedRun):
         """Prepare a new run with the sequence, the profile and the options of an earlier one.
 
         It uses the files' content from the start of the earlier run, even if the files have changed. Plugins
-        and calibrations are today's. Any difference from the earlier run is a warning.
+        and calibrations are current. Any difference from the earlier run is a warning.
 
         Args:
             run: The earlier run, as its folder or any file in it, its name or number.

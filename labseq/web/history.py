@@ -132,7 +132,7 @@ class RunHistory:
             yield from itertools.islice(readable, len(self) - first)
 
     def line_of(self, shot: int, attempt: int | None = None) -> int | None:
-        """The line of a shot that counts, or of one attempt. None if there is no such line."""
+        """The line of a complete shot, or of one attempt. None if there is no such line."""
         if attempt is None:
             return self._line_of.get(shot)
         for line in range(len(self._shot) - 1, -1, -1):

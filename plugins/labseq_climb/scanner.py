@@ -19,7 +19,7 @@ class ClimbSettings(Settings):
     """How far it steps, in fractions of the range of each address."""
 
     step: Part = Field(default=0.25, description="first step, as a fraction of each range")
-    min_step: Part = Field(default=0.05, description="shortest step; the scan ends when none is left")
+    min_step: Part = Field(default=0.05, description="shortest step, after which the scan ends")
 
 
 class Climb:

@@ -70,7 +70,7 @@ class ExternalStaticTweezers(StaticTweezers):
         """Accept only None.
 
         Raises:
-            LimitError: Amplitudes are given.
+            LimitError: ``amplitudes`` is not None.
         """
         self._check_open()
         if amplitudes is not None:

@@ -112,7 +112,7 @@ class AravisConnection(Connection):
 
     Attributes:
         camera: Aravis' camera, None unless it is open.
-        packet_size: Bytes of a network packet, None to leave the camera's.
+        packet_size: Bytes of a network packet, None to keep the present size.
     """
 
     def __init__(self, settings: GenicamSettings, context: Context) -> None:

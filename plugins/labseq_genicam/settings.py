@@ -42,7 +42,7 @@ class StandardSettings(CameraSettings):
     frame_rate: Annotated[Frequency, Field(gt=0)] | None = Field(
         default=None,
         description="exposures per second with the internal trigger, such as `100 Hz`. With none, each "
-        "begins when the one before is read out",
+        "begins when the previous frame is read out",
     )
     trigger_line: str = Field(
         default="Line1", min_length=1, description="input of the external trigger, as the camera calls it"
@@ -54,7 +54,7 @@ class StandardSettings(CameraSettings):
         default=None,
         ge=-100,
         le=1e6,
-        description="analogue gain in the camera's unit, mostly dB, or none to leave the camera's",
+        description="analogue gain in the camera's unit, mostly dB, or none to keep the present gain",
     )
     gain_raw: int | None = Field(
         default=None,
@@ -62,12 +62,12 @@ class StandardSettings(CameraSettings):
         description="analogue gain in steps of the camera, for older cameras that have no `gain`",
     )
     packet_size: Annotated[int, Field(ge=220, le=65535)] | None = Field(
-        default=None, description="bytes of a network packet (GigE), or none to leave the camera's"
+        default=None, description="bytes of a network packet (GigE), or none to keep the present size"
     )
     packet_delay: Duration | None = Field(
         default=None,
-        description="pause between two network packets (GigE), for cameras on one cable, or none to leave "
-        "the camera's",
+        description="pause between two network packets (GigE), for cameras on one cable, or none to keep "
+        "the present pause",
     )
 
     @field_validator("camera", "serial", mode="before", check_fields=False)

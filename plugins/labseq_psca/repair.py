@@ -154,7 +154,7 @@ class RepairPlanner:
         planner: The other planner.
 
     Attributes:
-        degree_of_parallelism: The other planner's.
+        degree_of_parallelism: That of the other planner.
     """
 
     def __init__(self, settings: RepairSettings, context: Context, planner: Planner) -> None:

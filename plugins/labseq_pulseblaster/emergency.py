@@ -20,7 +20,7 @@ HOLD_NS = 1e6
 
 
 class SpinapiError(Exception):
-    """A call was refused. The text is SpinCore's."""
+    """A call was refused. The text comes from SpinCore's library."""
 
 
 def prepare(**board: Any) -> None:

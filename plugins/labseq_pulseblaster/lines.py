@@ -162,7 +162,7 @@ class PulseBlasterLines(Lines):
             self._is_running = False
 
     def self_test(self) -> None:
-        """Play a program that changes no line, and check that the clock is the model's.
+        """Play a program that changes no line, and check that the clock matches the model.
 
         Raises:
             DeviceError: The program ended too early.

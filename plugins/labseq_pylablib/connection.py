@@ -142,7 +142,7 @@ class Connection(ABC):
         """Start to cool. Returns the temperature that the camera took, None if it has no cooler."""
 
     def set_cycle(self, cycle_s: float) -> float:
-        """Set the time from one exposure to the next, and return the camera's, in seconds."""
+        """Set the time from one exposure to the next, and return the camera's value, in seconds."""
         raise NotImplementedError(cycle_s)
 
     def stamps(self, info: Any) -> tuple[int | None, float]:

@@ -38,7 +38,7 @@ class PylablibSettings(CameraSettings):
     readout_mode: str | None = Field(
         default=None,
         description="speed of the read-out by the name that the camera gives it, such as `slow` (ultra-quiet "
-        "scan of an ORCA-Quest), or none to leave the camera's",
+        "scan of an ORCA-Quest), or none to keep the present speed",
     )
     trigger_edge: Literal["rising", "falling"] = Field(
         default="rising", description="edge of the external trigger that starts an exposure"

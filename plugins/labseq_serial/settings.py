@@ -88,7 +88,7 @@ class CommandSettings(Settings):
     error: Text | None = Field(default=None, description="pattern of a reply that reports an error")
     makes: dict[str, bool | int | str] = Field(
         default={},
-        description="values that the command leads to. They are read first, and if they have these values "
+        description="values after the command. They are read first, and if they have these values "
         "already, nothing is sent. Afterwards they are read until they have them",
     )
     repeatable: bool = Field(

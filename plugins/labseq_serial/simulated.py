@@ -15,7 +15,7 @@ class SimulatedLine:
     """Keeps the values that commands set, and replies like the instrument. It has the methods of a ``Line``.
 
     A value with the name of an argument is that argument's last value. A value that a command ``makes`` is as
-    the command made it. Any other value is its example's, or within its limits. Texts take as long as on a
+    the command made it. Other values match their examples or limits. Texts take as long as on a
     line.
     """
 

@@ -298,7 +298,7 @@ class InterlockSettings(Settings):
     min: Number | None = Field(default=None, description="lowest allowed value")
     max: Number | None = Field(default=None, description="highest allowed value")
     one_of: tuple[Scalar, ...] = Field(default=(), description="allowed values of a bool or text")
-    message: str = Field(default="", description="what to do if the condition is not met, for the message")
+    message: str = Field(default="", description="advice in the message if the condition is not met")
     max_age: Duration = Field(
         default=0.0,
         description="how old a reading may be. Each check that needs a new one waits for the instrument",
@@ -372,7 +372,7 @@ class ValueSettings(LimitedSettings):
     def reply_with(self, value: Scalar) -> str | None:
         """A reply with this value by a simulated instrument, None if the profile needs an example.
 
-        The value replaces the example's. If the result does not match the pattern, the reply is the example.
+        The value is put into the example. If the result does not match the pattern, it is the example.
         """
         if self.example is None:
             return example_of(self.reply, self._written(value))

@@ -29,7 +29,7 @@ class SimulatedErrors(Settings):
     """Errors of the simulated SLM that its driver does not know (ours)."""
 
     phase_range: Fraction = Field(
-        default=0.08, description="by how much the largest phase exceeds the look-up table's"
+        default=0.08, description="fraction by which the largest phase exceeds that of the look-up table"
     )
     phase_curve: Angle = Field(
         default=0.25, description="amplitude of a further error of the phase, one period over all levels"

@@ -54,7 +54,7 @@ def off(library: str, card: str, n_outputs: int = 2) -> str:
         What was done.
 
     Raises:
-        EmergencyError: The card cannot be opened, or refuses. The text is the driver library's.
+        EmergencyError: The card cannot be opened, or refuses. The text comes from the driver library.
     """
     prepare(library, card, n_outputs)
     device = _Card(load(library), card, n_outputs)

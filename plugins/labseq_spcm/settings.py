@@ -37,7 +37,7 @@ class CardFaults(Settings):
     )
     position_lag: Duration = Field(default=0.0, description="how late the position of a transfer is reported")
     fifo_short: int = Field(
-        default=0, ge=0, description="bytes by which the card's buffer is smaller than its size"
+        default=0, ge=0, description="bytes by which the card's buffer is shorter than its nominal size"
     )
     pinning: Duration = Field(default=0.0, description="time to name a transfer buffer")
     underrun_not_ready: bool = Field(
@@ -69,7 +69,7 @@ class SpcmSettings(Settings):
     serial: int = Field(default=0, ge=0, description="serial number that the card must have, or 0 for any")
     mode: Mode = Field(
         default="sequence",
-        description="`sequence` uploads a program in parts while a loop plays that then leads to them. "
+        description="`sequence` uploads a program in parts while an idle loop plays, then jumps to it. "
         "`replay` uploads it whole, then plays it. `fifo` streams it while it is being rendered. "
         "`stream` does so too, spliced into silence that the card plays all the time",
     )

@@ -105,7 +105,7 @@ def stream_program(
     block: int,
     workspaces: dict[tuple[int, int], Any],
 ) -> Program:
-    """Make a program for the loop, whole blocks of samples long. The workspaces must live as long."""
+    """Make a program for the loop, whole blocks of samples long. It needs the workspaces while it plays."""
     renderer = Renderer(program, sample_rate_hz)
     axes, words = renderer.words(workspaces), np.zeros(k.N_PROGRAM, np.int64)
     n_samples = max(1, math.ceil(renderer.n_samples / SAMPLE_STEP)) * SAMPLE_STEP

@@ -198,7 +198,7 @@ class TweezerImageSettings(Settings):
     )
 
     def image(self) -> ImageSettings:
-        """The settings of a camera for atoms with the same image."""
+        """The same sensor and optics as settings of a camera for atoms."""
         sensor = QcmosSettings(
             quantum_efficiency=1.0, read_noise=2.0, electrons_per_adu=0.1, full_well=7000.0
         )
@@ -329,7 +329,7 @@ class QubitSettings(Settings):
         default=5e-6, description="time constant with which push-out light removes atoms (ours)"
     )
     push_out_time_other: PositiveDuration = Field(
-        default=5e-3, description="time constant for the lower level, which it should not empty (ours)"
+        default=5e-3, description="time constant with which it also removes atoms in the lower level (ours)"
     )
 
     @property
@@ -364,7 +364,7 @@ class SimulationSettings(Settings):
     imaging_loss: Fraction = Field(
         default=0.00314,
         lt=1,
-        description="loss in one exposure of 45 ms beyond the lifetime's. Longer exposures have the same "
+        description="loss in one exposure of 45 ms besides the lifetime. Longer exposures have the same "
         "rate (derived: with the lifetime it gives the paper's survival of 99.55 %)",
     )
     imaging_loss_exposure: PositiveDuration = Field(

@@ -69,7 +69,7 @@ def test_a_condition_chooses_one_value_and_the_fit_is_that_of_one_axis(two: labs
     at_33 = two.fits(SURVIVAL, "exponential")[1].fit
     assert at_33 is not None
     assert two.select(f"{VACUUM} == 33 s").fit(SURVIVAL, "exponential").as_json() == at_33.as_json()
-    with pytest.raises(ConfigError, match=f"there are 2 values of {VACUUM} to fit at"):
+    with pytest.raises(ConfigError, match=f"there are 2 values of {VACUUM}, each with its own fit"):
         two.fit(SURVIVAL, "exponential")
 
 
