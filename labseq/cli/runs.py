@@ -52,7 +52,7 @@ COLUMNS: Final[Sequence[Column[RunEntry]]] = (
 
 
 def _note(run: RunEntry) -> str:
-    """Tags and note. Of a failed run also the reason, without the name of the error."""
+    """Tags and note. For a failed run also the reason, without the name of the error."""
     why = "(" + re.sub(r"^[A-Z]\w*: ", "", run.error) + ")" if run.status == "failed" else ""
     return " ".join(text for text in (*(f"[{tag}]" for tag in run.tags), run.note, why) if text)
 

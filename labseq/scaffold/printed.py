@@ -87,7 +87,7 @@ COLUMNS: Final[Mapping[str, str]] = {
     "modelled": "time in the virtual lab, or predicted by a model of the device",
     "median": "half of the times are shorter",
     "over": "number of times that the stage took longer than its budget",
-    "kept": "number of attempts at a shot that failed and were repeated, with files that stay",
+    "kept": "number of failed attempts at shots that were repeated, whose files are kept",
     "repeated": "attempts at shots that failed and were repeated",
     "best so far": "the best point of an adaptive scan until now",
     "run": "day and name of the run's folder",

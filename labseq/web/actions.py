@@ -300,7 +300,7 @@ def _properties(schema: Schema, definitions: Schema, data: Mapping[str, Any]) ->
 
 
 def _resolved(schema: Schema, definitions: Schema) -> Schema:
-    """A schema with its reference filled in. Of several alternatives, the first that is not null."""
+    """A schema with its reference filled in. With several alternatives, the first that is not null."""
     if "$ref" in schema:
         return {**(definitions.get(str(schema["$ref"]).rpartition("/")[2]) or {}), **schema}
     alternatives = [option for option in schema.get("anyOf") or () if option.get("type") != "null"]

@@ -181,7 +181,7 @@ def line(form: Form, word: str, facts: Mapping[str, Any]) -> str:
 
 
 def _flat(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """The facts of a line of text. Of the images it has the first, the last and which were judged."""
+    """The facts of a line of text. It has the first and the last image, and which images were judged."""
     flat = {key: value for key, value in facts.items() if not isinstance(value, list) and value is not None}
     last = {key: flat.pop(key) for key in ("occupancy", "file", "run", "reason") if key in flat}
     if images := facts.get("images"):

@@ -38,7 +38,7 @@ def read_look_up_table(path: Path | None) -> NDArray[np.float64]:
     """
     if path is None:
         return np.linspace(0.0, 2 * math.pi, LEVELS, endpoint=False)
-    expected = f"{LEVELS} finite phases in rad, which differ"
+    expected = f"{LEVELS} finite phases in rad, not all equal"
     table = np.asarray(_array(path, expected), np.float64)
     if table.shape != (LEVELS,) or not np.isfinite(table).all() or np.ptp(table) == 0:
         raise BadFileError(path, f"it holds an array of shape {table.shape}", expected)
