@@ -91,7 +91,7 @@ class Entry:
 
     @property
     def origin(self) -> str:
-        """Name of the plugin that registered it."""
+        """Name of the plugin that registered the entry."""
         return self.owner.name
 
     @property

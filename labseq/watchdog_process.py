@@ -284,7 +284,7 @@ class Hanging:
 
     @property
     def is_stopped(self) -> bool:
-        """Whether a signal or a debugger has stopped it."""
+        """Whether a signal or a debugger has stopped the process."""
         return "T" in _threads(self._pid)[0]
 
 

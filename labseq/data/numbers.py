@@ -25,7 +25,7 @@ class Parameter:
 
     @property
     def unit(self) -> str:
-        """Its SI unit. "" for none."""
+        """SI unit of the value. "" for none."""
         return self.text_unit.replace("%/", "1/").replace("%", "")
 
     def __str__(self) -> str:

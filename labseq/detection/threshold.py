@@ -59,7 +59,7 @@ class ComparingDetector(ABC):
         return self._known.positions_px
 
     def describe(self) -> Mapping[str, str]:
-        """Where its sites and thresholds come from."""
+        """Where the detector's sites and thresholds come from."""
         return {"sites": self._known.source, "thresholds": self._thresholds_source}
 
     def detect(self, frame: Frame) -> tuple[Occupancy, NDArray[np.float32], NDArray[np.float64]]:

@@ -154,12 +154,12 @@ class Extent:
 
     @property
     def width(self) -> float:
-        """Its width."""
+        """Width of the area."""
         return self.right - self.left
 
     @property
     def height(self) -> float:
-        """Its height."""
+        """Height of the area."""
         return self.bottom - self.top
 
 

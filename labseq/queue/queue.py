@@ -113,12 +113,12 @@ class Entry:
 
     @property
     def is_complete(self) -> bool:
-        """Whether its run is complete, whether the queue or `labseq resume` completed it."""
+        """Whether the run of the entry is complete, by the queue or by `labseq resume`."""
         return self.run_dir is not None and read_state(self.run_dir)[0] == "complete"
 
     @property
     def state(self) -> str:
-        """Its state in one word: its status, "interrupted" or "complete"."""
+        """State of the entry in one word: its status, "interrupted" or "complete"."""
         if self.is_complete:
             return "complete"
         return "interrupted" if self.is_interrupted else self.status

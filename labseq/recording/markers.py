@@ -50,7 +50,7 @@ class Marker:
         return self.owner is not None and self.owner.is_here and self.owner.is_running
 
     def concerns(self, profile: str, hardware: Collection[str]) -> bool:
-        """Whether it is of this profile or shares a device with it. True if the marker cannot be read."""
+        """Whether the run used this profile or shares a device with it. True if the marker cannot be read."""
         return self.owner is None or self.profile == profile or not self.hardware.isdisjoint(hardware)
 
 

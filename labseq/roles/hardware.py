@@ -98,7 +98,7 @@ class Hardware(ABC):
 
     @property
     def idle_output(self) -> str:
-        """Its output when nothing plays, in a few words for ``labseq check``. "" for no output."""
+        """Output when nothing plays, in a few words for ``labseq check``. "" for no output."""
         return ""
 
     def check_settings(self) -> Mapping[str, Problem]:
@@ -249,7 +249,7 @@ class MobileTweezers(Hardware):
 
     @property
     def waits_for_trigger(self) -> bool:
-        """True if ``play`` only arms them, and an edge at their input starts them. Known before ``open()``.
+        """True if ``play`` only arms the device, and an edge at its input starts it. Known before ``open()``.
 
         Drivers with this ability use it if ``trigger_line(context.lines, "mobile_tweezers")`` names a line.
         """

@@ -16,7 +16,7 @@ Part = Annotated[float, Field(ge=0.001, le=1)]
 
 
 class ClimbSettings(Settings):
-    """How far it steps, in fractions of the range of each address."""
+    """Lengths of the steps, as fractions of the range of each address."""
 
     step: Part = Field(default=0.25, description="first step, as a fraction of each range")
     min_step: Part = Field(default=0.05, description="shortest step, after which the scan ends")

@@ -188,7 +188,7 @@ class Property(IntEnum):
 
     @property
     def text(self) -> str:
-        """Its name as ``dcamprop_getname`` gives it."""
+        """Name of the property as ``dcamprop_getname`` gives it."""
         return self.name.replace("_", " ")
 
 

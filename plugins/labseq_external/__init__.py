@@ -31,7 +31,7 @@ class ExternalSettings(Settings):
     """Static tweezers that another system holds, which have no settings."""
 
     def identities(self) -> tuple[str, ...]:
-        """Nothing, because any number of processes may rely on them."""
+        """No names, because any number of processes may use these tweezers."""
         return ()
 
 
@@ -94,7 +94,7 @@ class ExternalStaticTweezers(StaticTweezers):
             raise LimitError(f"{self._name}: ramp", value, "1, because another system holds the array")
 
     def describe(self) -> Mapping[str, Any]:
-        """Say that nothing is known of them."""
+        """Report that nothing is known of these tweezers."""
         return {"model": "held by another system"}
 
     def _check_open(self) -> None:

@@ -55,7 +55,7 @@ class _Go:
 
     @property
     def taken(self) -> bool:
-        """Whether a step has taken it."""
+        """Whether a step has taken the signal."""
         return not math.isnan(self.taken_s)
 
 

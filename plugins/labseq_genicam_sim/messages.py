@@ -35,7 +35,7 @@ class Faults:
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """How the camera starts.
+    """Settings with which the camera starts.
 
     Attributes:
         serial: Serial number, at most 15 bytes.

@@ -63,7 +63,7 @@ class Spinapi:
         return self._run(self._board.open)
 
     def pb_close(self) -> int:
-        """Close it. It goes on with its program."""
+        """Close the board, which continues its program."""
         return self._run(self._board.close)
 
     def pb_core_clock(self, clock_mhz: float) -> None:
@@ -87,11 +87,11 @@ class Spinapi:
         return self._run(self._board.start)
 
     def pb_stop(self) -> int:
-        """Stop it. The next start begins at its first instruction."""
+        """Stop the program. The next start begins at its first instruction."""
         return self._run(self._board.reset)
 
     def pb_reset(self) -> int:
-        """Stop it. The next start begins at its first instruction."""
+        """Stop the program. The next start begins at its first instruction."""
         return self._run(self._board.reset)
 
     def pb_read_status(self) -> int:

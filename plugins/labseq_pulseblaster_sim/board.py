@@ -71,7 +71,7 @@ class Board:
         self._is_open, self._is_reset = True, True
 
     def close(self) -> None:
-        """Close it. It goes on with its program."""
+        """Close the board, which continues its program."""
         self._reach()
         self._is_open = False
 
@@ -154,7 +154,7 @@ class Board:
         self._is_reset, self._is_waiting, self._end_s = True, False, -math.inf
 
     def status(self) -> int:
-        """Its present state."""
+        """Present state of the board."""
         self._reach()
         if self._is_reset:
             return Status.STOPPED | Status.RESET

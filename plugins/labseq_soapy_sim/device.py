@@ -198,7 +198,7 @@ class SimulatedDevice:
 
     @property
     def time_ns(self) -> int:
-        """Its clock, which goes at the speed of the computer's."""
+        """Time of its clock, which runs as fast as the computer's clock."""
         return int(1e9 * (self._clock.now() - self._zero_s))
 
     def set_up_stream(self, channels: Sequence[int], arguments: str) -> None:

@@ -238,7 +238,7 @@ class SoapyDevice:
 
     @property
     def time_ns(self) -> int:
-        """Its clock."""
+        """Time of the radio's clock."""
         return int(_call("getHardwareTime", self._device, b""))
 
     def set_up_stream(self, channels: Sequence[int], arguments: str) -> None:

@@ -180,7 +180,7 @@ class SimulatedCard:
             return is_free
 
     def release(self) -> None:
-        """Close it. Transfers end, everything else goes on."""
+        """Close the card. Transfers end, everything else continues."""
         with self._lock:
             self._machine.stop_dma(self._advance())
             self._machine.buffer = None

@@ -60,7 +60,7 @@ class Step:
 
     @property
     def loops(self) -> int:
-        """How often it plays the segment before it goes on."""
+        """How often the step plays its segment before the next step."""
         return self.word >> 32 & r.SPCSEQ_LOOPMASK
 
     @property

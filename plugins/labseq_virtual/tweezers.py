@@ -115,11 +115,11 @@ class VirtualMobileTweezers(VirtualDriver, MobileTweezers):
 
     @property
     def waits_for_trigger(self) -> bool:
-        """Whether a line triggers them."""
+        """Whether a line triggers the tweezers."""
         return self._is_wired
 
     def open(self) -> None:
-        """Connect to the simulation, and to the line that triggers them."""
+        """Connect to the simulation, and to the line that triggers the tweezers."""
         super().open()
         if self._is_wired:
             self._simulation.wire("mobile_tweezers", lambda t_s, _width_s: self._start(t_s))
