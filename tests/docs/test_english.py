@@ -1,8 +1,10 @@
-"""Sentences of the pages state one fact each: few are joined by a semicolon or a colon."""
+"""Sentences of pages and docstrings state one fact each: few are joined by a semicolon or a colon."""
 
 from __future__ import annotations
 
+import ast
 import re
+from pathlib import Path
 
 from .blocks import PAGES
 
@@ -23,5 +25,19 @@ def test_few_sentences_are_joined() -> None:
     text = "\n".join(prose(page.read_text("utf-8")) for page in PAGES)
     n_words = len(re.findall(r"[\w'-]+", text))
     assert n_words > 30_000
-    assert 1000 * len(re.findall(r";", text)) / n_words < 3.6
-    assert 1000 * len(re.findall(r"\w\)?: +[a-z0-9]", text)) / n_words < 3.5
+    assert 1000 * len(re.findall(r";", text)) / n_words < 1.5
+    assert 1000 * len(re.findall(r"\w\)?: +[a-z0-9]", text)) / n_words < 2.5
+
+
+def test_few_sentences_of_docstrings_are_joined() -> None:
+    root = Path(__file__).parents[2]
+    text = ""
+    for file in (*root.glob("labseq/**/*.py"), *root.glob("plugins/**/*.py")):
+        nodes = ast.walk(ast.parse(file.read_text("utf-8")))
+        values = [node.value for node in nodes if isinstance(node, ast.Expr)]
+        text += "\n".join(
+            one.value for one in values if isinstance(one, ast.Constant) and isinstance(one.value, str)
+        )
+    n_words = len(text.split())
+    assert n_words > 100_000
+    assert 1000 * len(re.findall(r"[a-z]; ", text)) / n_words < 1.0
