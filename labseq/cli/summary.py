@@ -173,10 +173,13 @@ class Summary:
         """A table of the points or cycles, and the statistics."""
         tables = self.scan.table(MAX_ROWS) if self.scan else cycle_table(self.statistics)
         has_missing = self.status in ("stopped", "failed") and self.shots + self.skipped < self.n_shots
-        resume = (
-            [f"resume it with: labseq resume {quoted(self.run_dir)}"] if self.run_dir and has_missing else []
-        )
-        return [*tables, *([""] if tables else []), *aligned(self._facts()), *resume]
+        next_step: list[str] = []
+        if has_missing and self.status == "failed" and not self.shots:
+            # a resumed run has the files as they were, and the cause is mostly in them
+            next_step = ["run the sequence again after the cause is corrected"]
+        elif has_missing and self.run_dir:
+            next_step = [f"resume it with: labseq resume {quoted(self.run_dir)}"]
+        return [*tables, *([""] if tables else []), *aligned(self._facts()), *next_step]
 
     def _facts(self) -> Facts:
         skipped = f", {self.skipped} skipped" if self.skipped else ""

@@ -51,7 +51,10 @@ def test_table_and_summary(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "defect-free       1 of 2 (50.0 %), 21.6 to 78.4 %" in lines  # one was not judged
     assert "filling           99.6(4) %" in lines
     folder = write_run(tmp_path / "c d", fake, shots[:1])
-    assert Summary.of(open_run(folder)).as_text()[-1] == f'resume it with: labseq resume "{folder}"'
+    summary = Summary.of(open_run(folder))
+    assert summary.as_text()[-1] == f'resume it with: labseq resume "{folder}"'
+    failed = replace(summary, status="failed", shots=0)
+    assert failed.as_text()[-1] == "run the sequence again after the cause is corrected"
 
 
 def test_json(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
