@@ -176,7 +176,7 @@ class Summary:
         next_step: list[str] = []
         if has_missing and self.status == "failed" and not self.shots:
             # a resumed run has the files as they were, and the cause is mostly in them
-            next_step = ["run the sequence again after the cause is corrected"]
+            next_step = ["correct the cause, then run the sequence again"]
         elif has_missing and self.run_dir:
             next_step = [f"resume it with: labseq resume {quoted(self.run_dir)}"]
         return [*tables, *([""] if tables else []), *aligned(self._facts()), *next_step]

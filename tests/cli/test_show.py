@@ -54,7 +54,7 @@ def test_table_and_summary(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixt
     summary = Summary.of(open_run(folder))
     assert summary.as_text()[-1] == f'resume it with: labseq resume "{folder}"'
     failed = replace(summary, status="failed", shots=0)
-    assert failed.as_text()[-1] == "run the sequence again after the cause is corrected"
+    assert failed.as_text()[-1] == "correct the cause, then run the sequence again"
 
 
 def test_json(fake: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
