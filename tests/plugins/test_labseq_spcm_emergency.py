@@ -49,7 +49,7 @@ SpcmSettings.look_ahead_s = lambda self, rate_hz: 0.1
 tones = np.linspace(12e6, 18e6, 5)
 grid = SiteGrid(5, 5, row_frequency_hz=tones, column_frequency_hz=tones)
 band = (10e6, 20e6)
-plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])] * 50)
+plan = Plan.from_batches([([(0, 0), (0, 2)], [(0, 1), (0, 3)])] * 75)
 
 def tweezers(state, mode, speed_m_s, n_batches, trigger="software", fill=0.1, keep_warm=None):
     rf = RfSpec(row_band_hz=band, column_band_hz=band)
@@ -65,8 +65,8 @@ def tweezers(state, mode, speed_m_s, n_batches, trigger="software", fill=0.1, ke
 
 parked = {"row_frequency": 10e6, "column_frequency": 10e6}
 devices = {
-    # it plays for 0.7 s after the kill, which is longer than the script takes
-    "fifo": tweezers("fifo", "fifo", 1e-5, 50, fill=0.5),
+    # it plays for 1 s after the kill, which is longer than the script takes
+    "fifo": tweezers("fifo", "fifo", 1e-5, 75, fill=0.8),
     "armed": tweezers("armed", "replay", 0.130, 2, "external"),
     "played": tweezers("played", "replay", 0.130, 1),
     "locked": tweezers("locked", "fifo", 1e-5, 50),
