@@ -115,8 +115,9 @@ def test_one_of_several_occupancies_in_the_files_of_other_programs(tmp_path: Pat
         ),
         (
             "a.h5",
-            "is not a shot's file of labseq; expected a shot's file; for another program",
+            "expected a shot's file; for another program's file, name the array as in",
         ),
+        ("a.h5", "is not a shot's file of labseq"),
         ("a.h5:time", "holds no array 'time'; expected scan 1/loaded (2, 2, 3)"),
         ("b.npz", "there is no such file"),
     ):
